@@ -1,0 +1,31 @@
+"""opfem: stress on tissue from the measured thickness of a soft layer.
+
+Units are mm, N, MPa, s, tonne; maps are indexed [y, x]; tension is positive and contact
+pressure is positive in compression.
+"""
+
+from .io import (
+    read_netcdf as read_netcdf,
+    read_thickness as read_thickness,
+    write_netcdf as write_netcdf,
+    write_thickness as write_thickness,
+    write_vtu as write_vtu,
+)
+from .measurement import MeasurementError as MeasurementError, ThicknessMap as ThicknessMap
+from .model import (
+    Bonded as Bonded,
+    Contact as Contact,
+    Displacement as Displacement,
+    ExponentialOverclosure as ExponentialOverclosure,
+    HardOverclosure as HardOverclosure,
+    Imprint as Imprint,
+    Layer as Layer,
+    LinearOverclosure as LinearOverclosure,
+    MooneyRivlin as MooneyRivlin,
+    NeoHooke as NeoHooke,
+    Palpation as Palpation,
+    Roller as Roller,
+    Traction as Traction,
+)
+from .results import summary as summary, to_xarray as to_xarray
+from .solvers import RESULTS as RESULTS, ConvergenceError as ConvergenceError, Newton as Newton, Solution as Solution, solve as solve

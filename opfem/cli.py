@@ -1,0 +1,393 @@
+"""The command line: `opfem palpate MAP --out DIR` turns a thickness map into files and pictures of stress.
+
+It reads, solves and writes with the same public functions as a notebook, and says what it assumed.
+"""
+
+import dataclasses
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+from cyclopts import App, Group, Parameter
+from rich.console import Console
+from rich.table import Table
+
+from .io import read_thickness, whole_file, write_netcdf, write_thickness, write_vtu
+from .measurement import EXAMPLE_LAYER, ThicknessMap, example_map
+from .model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
+from .results import summary, summary_rows, to_xarray
+from .solvers import ConvergenceError, Newton, Solution, solve
+
+FINISHED = "result.nc"
+"""Written last: a folder that holds it holds a whole result."""
+FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", FINISHED)
+
+# The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
+PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
+
+app = App(
+    name="opfem",
+    help="Stress on tissue from the measured thickness of a soft layer.",
+    default_parameter=Parameter(negative=()),
+)
+
+
+@Parameter(name="*", group=Group("Map", sort_key=1))
+@dataclass(frozen=True)
+class MapOptions:
+    """How to read the loaded and the unloaded thickness."""
+
+    l0: Annotated[str | None, Parameter(help="Unloaded thickness: a number in mm, or the path of a map.")] = None
+    extent: Annotated[
+        tuple[float, float] | None, Parameter(help="LX LY from the first to the last sample in mm; this or --spacing.")
+    ] = None
+    spacing: Annotated[float | None, Parameter(help="Distance between samples in mm, the same in x and y.")] = None
+    unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
+    std: Annotated[float | None, Parameter(help="Standard deviation of the thickness noise in mm.")] = None
+    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
+    l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
+    smooth: Annotated[
+        float | None,
+        Parameter(help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element."),
+    ] = None
+
+
+@Parameter(name="*", group=Group("Layer", sort_key=2))
+@dataclass(frozen=True)
+class LayerOptions:
+    """The layer and its mesh."""
+
+    c10: Annotated[
+        float | None, Parameter(help=f"Mooney–Rivlin C10 in MPa. Default: the published {PUBLISHED_C10}.")
+    ] = None
+    c01: Annotated[
+        float | None, Parameter(help=f"Mooney–Rivlin C01 in MPa. Default: the published {PUBLISHED_C01}.")
+    ] = None
+    bulk: Annotated[
+        float | None,
+        Parameter(help=f"Bulk modulus in MPa; required with --c10 or --c01. Default: {PUBLISHED_BULK}, K/µ = 20."),
+    ] = None
+    layer_extent: Annotated[
+        tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
+    ] = None
+    elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
+        40,
+        40,
+        4,
+    )
+    element: Annotated[
+        Literal["mean_dilatation", "full"], Parameter(help="Element; only the default is free of locking.")
+    ] = "mean_dilatation"
+    sides: Annotated[Literal["free", "roller"], Parameter(help="What the layer's sides meet.")] = "free"
+
+
+@Parameter(name="*", group=Group("Contact", sort_key=3))
+@dataclass(frozen=True)
+class ContactOptions:
+    """Contact with window and sample."""
+
+    window_friction: Annotated[float, Parameter(help="Coulomb friction at the window.")] = 0.15
+    sample_friction: Annotated[float, Parameter(help="Coulomb friction at the sample.")] = 0.05
+    p0: Annotated[float, Parameter(help="Sample contact: pressure at zero clearance in MPa.")] = 2.0
+    c0: Annotated[float, Parameter(help="Sample contact: clearance where pressure starts in mm.")] = 0.01
+    correct_approach: Annotated[
+        bool, Parameter(help="Also shift out the approach of sample and layer that the contact law causes.")
+    ] = False
+
+
+@Parameter(name="*", group=Group("Run", sort_key=4))
+@dataclass(frozen=True)
+class RunOptions:
+    """The run itself."""
+
+    increments: Annotated[int | None, Parameter(help="Load increments. Default: the solver's own.")] = None
+    force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
+    debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False
+
+
+def main(tokens: Sequence[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 1 failed, 2 misused, 130 interrupted.
+
+    Args:
+        tokens: Arguments; None takes those of the process.
+    """
+    app(tokens)
+
+
+@app.command
+def palpate(
+    map: Annotated[str, Parameter(name="MAP")],
+    /,
+    *,
+    out: Path,
+    reading: MapOptions = MapOptions(),
+    layer: LayerOptions = LayerOptions(),
+    contact: ContactOptions = ContactOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Compute the stress map of a measured thickness map.
+
+    Writes result.nc, result.vtu, summary.json, pressure.png and report.png.
+
+    Args:
+        map: Loaded thickness (.mat, .npy, .npz, .tif, .csv), or the word `example` for a built-in one.
+        out: Folder of the results.
+        reading: How to read the maps.
+        layer: The layer and its mesh.
+        contact: Contact with window and sample.
+        run: The run itself.
+    """
+    with _reporting(run.debug):
+        jax.config.update("jax_enable_x64", True)
+        _refuse_finished(out, run.force)
+        measured, unloaded = read_maps(map, reading)
+        palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
+        settings = _settings(map, reading, layer, contact, load)
+        _prepare(out)
+        if map == "example":
+            write_thickness(measured, out / "example_map.npz")
+        _show_assumptions(palpation, load, layer, contact)
+        try:
+            solution = solve(palpation, load, _solver(run))
+        except ConvergenceError as failure:
+            _remove(out)
+            _write_summary(failure.solution, settings, out)
+            raise
+        write_results(solution, measured, settings, out)
+        _show_results(solution, out)
+
+
+def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | ThicknessMap]:
+    """Read the loaded map, as measured, and the unloaded thickness [mm].
+
+    Args:
+        path: File of the loaded map, or `example`.
+        options: How to read.
+
+    Raises:
+        ValueError: When options are missing or contradict each other.
+        MeasurementError: For anything wrong with a file.
+    """
+    grid: dict[str, Any] = {"extent": options.extent, "spacing": options.spacing, "unit": options.unit}
+    if path == "example":
+        given = [f"--{name}" for name in ("extent", "spacing", "std", "variable") if getattr(options, name) is not None]
+        if given or options.unit != "mm":
+            raise ValueError(f"The example knows its own grid; leave out {', '.join(given) or '--unit'}.")
+        loaded = example_map()
+    else:
+        loaded = read_thickness(path, std=options.std, variable=options.variable, **grid)
+    if options.l0 is None:
+        if path != "example":
+            raise ValueError("--l0 is needed: the unloaded thickness, a number in mm or the path of a map.")
+        return loaded, EXAMPLE_LAYER
+    try:
+        return loaded, float(options.l0)
+    except ValueError:
+        return loaded, read_thickness(options.l0, variable=options.l0_variable, **grid)
+
+
+def state_experiment(
+    measured: ThicknessMap,
+    unloaded: float | ThicknessMap,
+    reading: MapOptions,
+    layer: LayerOptions,
+    contact: ContactOptions,
+) -> tuple[Palpation, Imprint]:
+    """State the experiment and its load; the maps are filled and smoothed here.
+
+    Args:
+        measured: Loaded thickness as measured.
+        unloaded: Unloaded thickness [mm].
+        reading: Smoothing.
+        layer: Material, mesh and sides.
+        contact: Contact with window and sample.
+
+    Raises:
+        ValueError: When options are missing or out of range.
+    """
+    extent = _layer_extent(measured, layer)
+    fwhm = reading.smooth
+    if fwhm is None:
+        fwhm = 0.5 * min(extent[0] / layer.elements[0], extent[1] / layer.elements[1])
+    if isinstance(unloaded, ThicknessMap):
+        unloaded = _ready(unloaded, fwhm)
+    palpation = Palpation(
+        Layer(unloaded, _material(layer)),
+        extent=extent,
+        elements=layer.elements,
+        window=Contact(HardOverclosure(), contact.window_friction),
+        sample=Contact(ExponentialOverclosure(contact.p0, contact.c0), contact.sample_friction),
+        sides=layer.sides,
+        element=layer.element,
+    )
+    return palpation, Imprint(_ready(measured, fwhm), correct_approach=contact.correct_approach)
+
+
+def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path) -> None:
+    """Write every file of a result, each whole or not at all, `result.nc` last.
+
+    Args:
+        solution: What was solved.
+        measured: Loaded thickness as measured, for the report.
+        settings: What the user asked for, for summary.json.
+        out: Folder of the results.
+    """
+    # Loaded here, so that the help and a refused run do not wait for matplotlib.
+    from .plot import plot_pressure, report_figure
+
+    dataset = to_xarray(solution)
+    figures = {"pressure.png": plot_pressure(dataset).figure, "report.png": report_figure(dataset, measured)}
+    _remove(out)
+    for name, figure in figures.items():
+        with whole_file(out / name) as temporary:
+            figure.savefig(temporary, dpi=200)
+    write_vtu(dataset, out / "result.vtu")
+    _write_summary(solution, settings, out)
+    write_netcdf(dataset, out / FINISHED)
+
+
+@contextmanager
+def _reporting(debug: bool) -> Iterator[None]:
+    """End with a message and an exit status instead of a traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _complain("Interrupted; no file was left half-written.")
+        raise SystemExit(130) from None
+    except Exception as cause:
+        if debug:
+            raise
+        expected = isinstance(cause, ValueError | OSError | ConvergenceError)
+        unexpected = f"Unexpected {type(cause).__name__}: {cause} (--debug shows where; please report it.)"
+        _complain(str(cause) if expected else unexpected)
+        raise SystemExit(1) from None
+
+
+def _complain(message: str) -> None:
+    Console(stderr=True, highlight=False).print(f"opfem: {message}", style="bold red", markup=False, soft_wrap=True)
+
+
+def _refuse_finished(out: Path, force: bool) -> None:
+    if (out / FINISHED).exists() and not force:
+        raise FileExistsError(
+            f"{out} holds a finished result ({FINISHED}). Pass --force to replace it, or another --out."
+        )
+
+
+def _prepare(out: Path) -> None:
+    """Find out before the long solve whether the results can be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as cause:
+        raise OSError(f"Cannot write results to {out}: {cause.strerror}. Choose another --out.") from cause
+
+
+def _remove(out: Path) -> None:
+    """Remove an earlier result, the mark of a finished one first."""
+    for name in reversed(FILES):
+        (out / name).unlink(missing_ok=True)
+
+
+def _ready(thickness: ThicknessMap, fwhm: float) -> ThicknessMap:
+    if np.any(thickness.mask) and not thickness.is_filled:
+        thickness = thickness.filled()
+    return thickness.smoothed(fwhm) if fwhm != 0 else thickness
+
+
+def _layer_extent(measured: ThicknessMap, options: LayerOptions) -> tuple[float, float]:
+    if options.layer_extent is not None:
+        return options.layer_extent
+    if np.any(measured.origin):
+        start = tuple(measured.origin.tolist())
+        raise ValueError(f"The map starts at (x, y) = {start} mm, the layer at (0, 0). Pass --layer-extent LX LY.")
+    Lx, Ly = measured.extent.tolist()
+    return Lx, Ly
+
+
+def _material(options: LayerOptions) -> MooneyRivlin:
+    if options.bulk is None and (options.c10 is not None or options.c01 is not None):
+        raise ValueError(
+            "--bulk [MPa] is needed with --c10 or --c01: opfem never guesses it. 20 times the shear "
+            "modulus 2 (C10 + C01) is what Abaqus/Explicit takes."
+        )
+    return MooneyRivlin(
+        c10=PUBLISHED_C10 if options.c10 is None else options.c10,
+        c01=PUBLISHED_C01 if options.c01 is None else options.c01,
+        bulk=PUBLISHED_BULK if options.bulk is None else options.bulk,
+    )
+
+
+def _settings(
+    path: str, reading: MapOptions, layer: LayerOptions, contact: ContactOptions, load: Imprint
+) -> dict[str, Any]:
+    """Collect what was asked for and what was assumed, for summary.json."""
+    given = {name: value for part in (reading, layer, contact) for name, value in dataclasses.asdict(part).items()}
+    material = _material(layer)
+    used = {name: float(getattr(material, name)) for name in ("c10", "c01", "bulk")}
+    used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(load.thickness)[-1]
+    assumed = [name for name in used if given[name] is None]
+    stated = {name: value for name, value in given.items() if value is not None}
+    return {"map": path, **stated, **used, "assumed": assumed}
+
+
+def _smoothing(thickness: ThicknessMap) -> list[float]:
+    return [float(step.numbers["fwhm"]) for step in thickness.steps if step.name == "smoothed"]
+
+
+def _solver(options: RunOptions) -> Newton:
+    return Newton() if options.increments is None else Newton(increments=options.increments)
+
+
+def _write_summary(solution: Solution, settings: dict[str, Any], out: Path) -> None:
+    with whole_file(out / "summary.json") as temporary:
+        text = json.dumps({**summary(solution), "settings": settings}, indent=2, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _show_assumptions(palpation: Palpation, load: Imprint, layer: LayerOptions, contact: ContactOptions) -> None:
+    material, thickness = _material(layer), load.thickness
+    missing = int(np.sum(thickness.mask))
+    unloaded = palpation.layer.thickness
+    published = [name for name in ("c10", "c01", "bulk") if getattr(layer, name) is None]
+    rows = {
+        "layer": f"{palpation.extent[0]:g} × {palpation.extent[1]:g} mm, "
+        + ("measured L0" if isinstance(unloaded, ThicknessMap) else f"L0 = {float(unloaded):g} mm"),
+        "map": f"{thickness.shape[1]} × {thickness.shape[0]} pixels, {missing} missing"
+        + (" and filled" if missing else ""),
+        "smoothing": " and ".join(f"{1e3 * width:g} µm FWHM" for width in _smoothing(thickness)) or "none",
+        "material": f"Mooney–Rivlin C10 = {1e3 * material.c10:g} kPa, C01 = {1e3 * material.c01:g} kPa, "
+        f"bulk = {1e3 * material.bulk:g} kPa (K/µ = {material.bulk / material.shear:.3g})",
+        "window": f"hard contact, friction {contact.window_friction:g}",
+        "sample": f"exponential contact p0 = {contact.p0:g} MPa, c0 = {1e3 * contact.c0:g} µm, "
+        f"friction {contact.sample_friction:g}",
+        "mesh": " × ".join(str(n) for n in palpation.elements) + f" {palpation.element} elements, sides {layer.sides}",
+    }
+    table = Table(box=None, show_header=False, padding=(0, 1))
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console = Console(highlight=False)
+    console.print("Solving for the stress on the sample, with")
+    console.print(table)
+    if published:
+        console.print(f"  Assumed: {', '.join(published)} of the published deck's layer. Is it yours?")
+
+
+def _show_results(solution: Solution, out: Path) -> None:
+    numbers = summary(solution)
+    table = Table("at the sample", "", "")
+    table.columns[1].justify = "right"
+    for row in summary_rows(numbers):
+        table.add_row(*row)
+    console = Console(highlight=False)
+    console.print(table)
+    if numbers["status_message"]:
+        console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
+    console.print(f"Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)

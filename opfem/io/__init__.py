@@ -1,0 +1,17 @@
+"""Files in and out: the only part of the package that touches a disk."""
+
+from ..measurement import MeasurementError
+from .atomic import whole_file
+from .netcdf import read_netcdf, write_netcdf
+from .thickness import read_thickness, write_thickness
+from .vtk import write_vtu
+
+__all__ = [
+    "MeasurementError",
+    "read_netcdf",
+    "read_thickness",
+    "whole_file",
+    "write_netcdf",
+    "write_thickness",
+    "write_vtu",
+]

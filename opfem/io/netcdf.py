@@ -1,0 +1,51 @@
+"""Datasets of results to and from netCDF-4 files.
+
+Edge of the chain: what `to_xarray` labelled is stored with all its attributes, and comes back the same.
+"""
+
+import os
+from pathlib import Path
+
+import xarray as xr
+
+from .atomic import whole_file
+
+_COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
+
+
+def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike) -> None:
+    """Write a dataset to a compressed netCDF-4 file, whole or not at all.
+
+    Args:
+        dataset: What `to_xarray` returned.
+        path: File to make or replace.
+
+    Raises:
+        ValueError: For anything but a dataset.
+        FileNotFoundError: When the folder does not exist.
+    """
+    if not isinstance(dataset, xr.Dataset):
+        raise ValueError(f"write_netcdf takes a dataset, got {type(dataset).__name__}. Pass to_xarray(solution).")
+    numeric = [name for name, values in dataset.variables.items() if values.ndim and values.dtype.kind in "fiub"]
+    encoding = {name: {**dataset[name].encoding, **_COMPRESSION} for name in numeric}
+    with whole_file(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+
+
+def read_netcdf(path: str | os.PathLike) -> xr.Dataset:
+    """Read a dataset that `write_netcdf` wrote, all of it into memory.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        FileNotFoundError: When there is no such file.
+        ValueError: When it is no netCDF-4 file, or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"Cannot read {path}: there is no such file.")
+    try:
+        return xr.load_dataset(path, engine="h5netcdf")
+    except OSError as cause:
+        raise ValueError(f"{path}: is not a netCDF-4 file, or is damaged ({cause}).") from cause

@@ -1,0 +1,71 @@
+"""The deformed layer for ParaView, as an unstructured grid of hexahedra.
+
+Edge of the chain: built from the dataset of `to_xarray`, or from one that was read back.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from .atomic import whole_file
+
+
+def write_vtu(dataset: xr.Dataset, path: str | os.PathLike) -> None:
+    """Write the deformed layer to a .vtu file, whole or not at all.
+
+    Points lie where the nodes are after loading [mm]. Array names end in their unit. What acts on a face
+    is NaN (status: -1) at points off that face, `stress_zz_MPa` in cells below the top ones.
+
+    Args:
+        dataset: What `to_xarray` returned.
+        path: File to make or replace; must end in .vtu.
+
+    Raises:
+        ValueError: For another suffix, or a failed solution, which has no deformed layer.
+        FileNotFoundError: When the folder does not exist.
+    """
+    # Loaded here, so that `import opfem` stays free of it.
+    import pyvista
+
+    path = Path(path)
+    if path.suffix.lower() != ".vtu":
+        raise ValueError(f"write_vtu writes .vtu, got {path}.")
+    displacement = dataset["displacement"].transpose("component", "z", "y", "x").values
+    if not np.isfinite(displacement).all():
+        raise ValueError(f"write_vtu needs a converged solution, got status {dataset.attrs.get('status')!r}.")
+    current = _reference(dataset) + displacement
+    # VTK's structured axes are the transpose of ours, x fastest in both.
+    grid = pyvista.StructuredGrid(*(np.ascontiguousarray(axis.T) for axis in current)).cast_to_unstructured_grid()
+    for name, values in _point_arrays(dataset, displacement).items():
+        grid.point_data[name] = values
+    layers = displacement.shape[1] - 1
+    grid.cell_data["stress_zz_MPa"] = _on_layer(dataset["stress_zz"].values, layers, top=True, elsewhere=np.nan)
+    with whole_file(path) as temporary:
+        grid.save(temporary)
+
+
+def _reference(dataset: xr.Dataset) -> Float[np.ndarray, "3 nz ny nx"]:
+    z = dataset["z"] * dataset["unloaded_thickness"]
+    x, y, z = xr.broadcast(dataset["x"], dataset["y"], z)
+    return np.stack([axis.transpose("z", "y", "x").values for axis in (x, y, z)])
+
+
+def _point_arrays(dataset: xr.Dataset, displacement: np.ndarray) -> dict[str, np.ndarray]:
+    arrays = {"displacement_mm": displacement.reshape(3, -1).T}
+    nodes = displacement.shape[1]
+    for prefix, top in (("", True), ("window_", False)):
+        pressure, traction = dataset[f"{prefix}pressure"].values, dataset[f"{prefix}traction"].values
+        arrays[f"{prefix}pressure_MPa"] = _on_layer(pressure, nodes, top, np.nan)
+        arrays[f"{prefix}traction_MPa"] = np.stack([_on_layer(part, nodes, top, np.nan) for part in traction], axis=1)
+        arrays[f"{prefix}contact_status"] = _on_layer(dataset[f"{prefix}contact_status"].values, nodes, top, -1)
+    return arrays
+
+
+def _on_layer(values: np.ndarray, layers: int, top: bool, elsewhere: float) -> np.ndarray:
+    """Spread the values of the top or bottom layer over all layers, and flatten, x fastest."""
+    spread = np.full((layers, *values.shape), elsewhere, values.dtype)
+    spread[-1 if top else 0] = values
+    return spread.ravel()

@@ -1,0 +1,100 @@
+"""Loads: what the sample does to the layer at the interface."""
+
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from .._checks import as_leaf, check_finite, concrete
+from ..measurement import ThicknessMap
+from .surface import INTERPOLATIONS, Interpolation
+
+
+class Imprint(eqx.Module):
+    """Press the measured loaded surface into the layer as a rigid body (route A).
+
+    The rigid surface moves from L0 to L1 along z, with x and y held, offset by the sample
+    law's zero-pressure clearance. The map is sampled at mesh spacing and continued at its
+    edge values.
+
+    Args:
+        thickness: Loaded thickness L1 [mm], masked pixels filled.
+        correct_approach: Also shift out the approach that the pressure itself causes.
+        interpolation: How the rigid surface runs between its mesh-spaced nodes: "cubic" (C²),
+            "catmull-rom" (C¹) or "bilinear" (C⁰; facets, as a meshed rigid body has them).
+
+    Raises:
+        ValueError: If the map has masked pixels that are not filled, or the interpolation is
+            unknown.
+    """
+
+    thickness: ThicknessMap
+    correct_approach: bool = eqx.field(static=True, default=False)
+    interpolation: Interpolation = eqx.field(static=True, default="cubic")
+
+    def __check_init__(self):
+        if not isinstance(self.thickness, ThicknessMap):
+            raise ValueError(f"Imprint.thickness must be a ThicknessMap, got {type(self.thickness).__name__}.")
+        missing = concrete(self.thickness.mask)
+        if missing is not None and missing.any() and not self.thickness.is_filled:
+            raise ValueError(
+                f"Imprint.thickness must have no masked pixels, got {int(missing.sum())} of {missing.size} "
+                "(mask=True means not data). Fill them first: thickness.filled()."
+            )
+        if self.interpolation not in INTERPOLATIONS:
+            raise ValueError(f"Imprint.interpolation must be one of {INTERPOLATIONS}, got {self.interpolation!r}.")
+
+
+class Traction(eqx.Module):
+    """Apply a dead load to the interface: force on the layer per reference area, fixed axes.
+
+    Args:
+        normal: Pressure-like part [MPa], positive in compression (its force points to -z):
+            a number, or interface nodes `(ny+1, nx+1)`.
+        lateral: `(2, ny+1, nx+1)` [MPa], x then y. None: Coulomb friction against a sample
+            fixed in x and y, bounded by the sample's friction × normal.
+
+    Raises:
+        ValueError: If a value is not finite or a shape is wrong.
+    """
+
+    normal: Array = eqx.field(converter=as_leaf)
+    lateral: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+
+    def __check_init__(self):
+        check_finite("Traction.normal", "MPa", self.normal)
+        if self.normal.ndim not in (0, 2):
+            raise ValueError(f"Traction.normal [MPa] must be a number or (ny+1, nx+1), got shape {self.normal.shape}.")
+        if self.lateral is not None:
+            check_finite("Traction.lateral", "MPa", self.lateral)
+            if self.lateral.ndim != 3 or self.lateral.shape[0] != 2:
+                raise ValueError(
+                    f"Traction.lateral [MPa] must be (2, ny+1, nx+1), x then y, got shape {self.lateral.shape}."
+                )
+
+
+class Displacement(eqx.Module):
+    """Impose u_z on the interface nodes.
+
+    Args:
+        uz: Displacement along z [mm], negative in compression: a number, or interface nodes
+            `(ny+1, nx+1)`.
+        lateral: "free", or "fixed" (u_x = u_y = 0 there).
+
+    Raises:
+        ValueError: If a value is not finite, a shape is wrong, or `lateral` is unknown.
+    """
+
+    uz: Array = eqx.field(converter=as_leaf)
+    lateral: Literal["free", "fixed"] = eqx.field(static=True, default="free")
+
+    def __check_init__(self):
+        check_finite("Displacement.uz", "mm", self.uz)
+        if np.ndim(self.uz) not in (0, 2):
+            raise ValueError(f"Displacement.uz [mm] must be a number or (ny+1, nx+1), got shape {self.uz.shape}.")
+        if self.lateral not in ("free", "fixed"):
+            raise ValueError(f'Displacement.lateral must be "free" or "fixed", got {self.lateral!r}.')
+
+
+Load = Imprint | Traction | Displacement

@@ -1,0 +1,86 @@
+"""The experiment: a layer between window and sample, its field, its mesh and its sides."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._checks import as_leaf, check_positive
+from .contact import Bonded, Contact, Roller, Side
+from .layer import Layer
+from .mesh import LayerMesh
+
+SIDES = ("x0", "x1", "y0", "y1")
+ELEMENTS = ("mean_dilatation", "full")
+
+
+class Palpation(eqx.Module):
+    """A layer pressed between the window and the sample.
+
+    Args:
+        layer: The layer.
+        extent: (Lx, Ly) [mm]: the layer covers 0..Lx, 0..Ly.
+        elements: (nx, ny, nz).
+        window: `Contact`, `Bonded` or `Roller` at z = 0.
+        sample: The same at the sample–layer interface.
+        sides: "free", "roller", or a dict of these by x0, x1, y0, y1 (missing ones are free).
+        element: "mean_dilatation" (locking-free) or "full" (plain 2×2×2).
+
+    Raises:
+        ValueError: If an argument is out of range or unknown.
+    """
+
+    layer: Layer
+    extent: Float[Array, "2"]
+    elements: tuple[int, int, int] = eqx.field(static=True)
+    window: Side
+    sample: Side
+    sides: tuple[str, str, str, str] = eqx.field(static=True)
+    element: Literal["mean_dilatation", "full"] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        layer: Layer,
+        extent,
+        elements: tuple[int, int, int],
+        window: Side,
+        sample: Side,
+        sides: str | Mapping[str, str] = "free",
+        element: str = "mean_dilatation",
+    ):
+        if not isinstance(layer, Layer):
+            raise ValueError(f"Palpation.layer must be a Layer, got {type(layer).__name__}.")
+        if np.shape(extent) != (2,):
+            raise ValueError(f"Palpation.extent [mm] must be (Lx, Ly), got {extent!r}.")
+        check_positive("Palpation.extent", "mm", jnp.asarray(extent))
+        counts = tuple(int(n) for n in elements)
+        if len(counts) != 3 or min(counts) < 1 or counts != tuple(elements):
+            raise ValueError(f"Palpation.elements must be three whole numbers (nx, ny, nz) ≥ 1, got {elements!r}.")
+        for name, side in (("window", window), ("sample", sample)):
+            if not isinstance(side, (Bonded, Roller, Contact)):
+                raise ValueError(f"Palpation.{name} must be Bonded(), Roller() or Contact(law, friction), got {side!r}.")
+        if element not in ELEMENTS:
+            raise ValueError(f"Palpation.element must be one of {ELEMENTS}, got {element!r}.")
+        self.layer = layer
+        self.extent = as_leaf(jnp.asarray(extent))
+        self.elements = counts
+        self.window = window
+        self.sample = sample
+        self.sides = _sides(sides)
+        self.element = element
+
+    def mesh(self) -> LayerMesh:
+        """Build the mesh, with the layer's thickness sampled at its nodes."""
+        nx, ny, nz = self.elements
+        flat = LayerMesh(jnp.zeros((ny + 1, nx + 1), self.extent.dtype), self.extent, nz)
+        return LayerMesh(self.layer.thickness_at(*flat.plane()), self.extent, nz)
+
+
+def _sides(sides: str | Mapping[str, str]) -> tuple[str, str, str, str]:
+    chosen = dict.fromkeys(SIDES, sides) if isinstance(sides, str) else {**dict.fromkeys(SIDES, "free"), **sides}
+    if set(chosen) != set(SIDES) or not set(chosen.values()) <= {"free", "roller"}:
+        raise ValueError(f'Palpation.sides must be "free", "roller" or a dict of these by {SIDES}, got {sides!r}.')
+    return tuple(chosen[side] for side in SIDES)

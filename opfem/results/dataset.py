@@ -1,0 +1,218 @@
+"""`to_xarray`: a solution as labelled data with units, and the record of how it was made.
+
+Last stage of the chain; what is written to files and drawn starts from this dataset.
+"""
+
+import json
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float
+
+from .._checks import concrete
+from ..model import Imprint
+from ..solvers import RESULTS, FaceResult, Solution
+from .fields import under_pixels
+from .provenance import describe, inputs_hash, steps_as_json, versions
+
+NODES = ("y", "x")
+IMAGE = ("y_image", "x_image")
+NOT_CONVERGED = -1
+"""Contact status where the solve failed."""
+
+_STATS = {
+    "newton_steps": ("1", "Newton steps of all load increments"),
+    "krylov_steps": ("1", "preconditioner applications of all linear solves"),
+    "increments": ("1", "load increments accepted"),
+    "attempts": ("1", "load increments tried"),
+    "residual": ("1", "unbalanced force over contact force"),
+    "load_fraction": ("1", "load fraction reached"),
+    "strain_energy": ("N mm", "strain energy of the layer"),
+    "friction_dissipation": ("N mm", "energy dissipated by friction"),
+    "force_sample": ("N", "force of the sample on the layer"),
+    "force_window": ("N", "force of the window on the layer"),
+    "force_hold": ("N", "force of the in-plane hold on the layer"),
+    "approach": ("mm", "approach of sample and layer that the contact law itself causes"),
+    "max_penetration": ("mm", "largest penetration"),
+    "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
+}
+Variable = tuple[tuple[str, ...], Any, dict[str, Any]]
+
+
+def to_xarray(solution: Solution) -> xr.Dataset:
+    """Label a solution: dims, positions, units, and how it was made.
+
+    Everything is in mm, N and MPa. Interface nodes are `y`, `x`; `x_current` and `y_current` say where
+    they have moved. `thickness` and `pressure_image` are on the pixels of the load's map, NaN where no
+    interface point lies under a pixel. Fields of a failed solve are NaN, its `contact_status` -1.
+
+    Args:
+        solution: One solution, outside jit.
+
+    Raises:
+        ValueError: For a traced or a batched solution.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import opfem as op
+        >>> def stress_map(solution):
+        ...     data = op.to_xarray(solution)
+        ...     return 1e3 * data.pressure  # kPa
+    """
+    _require_one(solution)
+    failed = status_name(solution) not in ("successful", "slides_off")
+    variables = {
+        **_volume(solution),
+        **_face("", "at the sample", solution.sample, failed),
+        **_face("window_", "at the window", solution.window, failed),
+        **_image(solution),
+        **_stats(solution.stats),
+    }
+    return xr.Dataset(variables, coords=_coordinates(solution), attrs=_record(solution))
+
+
+def status_name(solution: Solution) -> str:
+    """Name how a solve ended, as a member of `RESULTS`."""
+    # Equinox offers no other way from an item to its name.
+    names = RESULTS._name_to_item
+    return next(name for name, item in names.items() if bool(item == solution.result))
+
+
+def status_message(solution: Solution) -> str:
+    """Say in words how a solve ended; empty when all is well."""
+    return RESULTS[solution.result]
+
+
+def _require_one(solution: Solution) -> None:
+    if any(concrete(leaf) is None for leaf in jax.tree.leaves(solution)):
+        raise ValueError("to_xarray needs known numbers, got a traced solution. Call it outside jit, grad and vmap.")
+    if solution.displacement.ndim != 4:
+        raise ValueError(
+            "to_xarray takes one solution with displacement (3, nz+1, ny+1, nx+1), got shape "
+            f"{solution.displacement.shape}. Pick one: jax.tree.map(lambda leaf: leaf[0], solutions)."
+        )
+
+
+def _variable(dims: tuple[str, ...], values: Any, units: str, long_name: str, **attrs: Any) -> Variable:
+    return dims, np.asarray(values), {"units": units, "long_name": long_name, **attrs}
+
+
+def _coordinates(solution: Solution) -> dict[str, Variable]:
+    X = np.asarray(solution.positions[:2, -1])
+    current = X + np.asarray(solution.displacement[:2, -1])
+    x, y = X[0, 0], X[1, :, 0]
+    layers = solution.positions.shape[1] - 1
+    grid = solution.thickness
+    return {
+        "x": _variable(("x",), x, "mm", "reference position along image columns"),
+        "y": _variable(("y",), y, "mm", "reference position along image rows"),
+        "z": _variable(("z",), np.arange(layers + 1) / layers, "1", "height over unloaded thickness, 0 at the window"),
+        "component": (("component",), np.array(["x", "y", "z"]), {"long_name": "component of a vector"}),
+        "lateral": (("lateral",), np.array(["x", "y"]), {"long_name": "component of an in-plane vector"}),
+        "x_current": _variable(NODES, current[0], "mm", "current position of interface nodes along image columns"),
+        "y_current": _variable(NODES, current[1], "mm", "current position of interface nodes along image rows"),
+        "x_element": _variable(("x_element",), 0.5 * (x[1:] + x[:-1]), "mm", "reference element centres along x"),
+        "y_element": _variable(("y_element",), 0.5 * (y[1:] + y[:-1]), "mm", "reference element centres along y"),
+        "x_image": _variable(("x_image",), grid.x, "mm", "position of image columns"),
+        "y_image": _variable(("y_image",), grid.y, "mm", "position of image rows"),
+    }
+
+
+def _volume(solution: Solution) -> dict[str, Variable]:
+    return {
+        "displacement": _variable(("component", "z", *NODES), solution.displacement, "mm", "displacement"),
+        "unloaded_thickness": _variable(NODES, solution.positions[2, -1], "mm", "unloaded thickness L0"),
+        "stress_zz": _variable(
+            ("y_element", "x_element"),
+            solution.stress_zz,
+            "MPa",
+            "Cauchy stress zz, mean over the top element, tension positive",
+        ),
+    }
+
+
+def _face(prefix: str, where: str, face: FaceResult, failed: bool) -> dict[str, Variable]:
+    status = np.full(face.status.shape, NOT_CONVERGED) if failed else np.asarray(face.status)
+    return {
+        f"{prefix}pressure": _variable(
+            NODES, face.pressure, "MPa", f"contact pressure {where} on the current area, compression positive"
+        ),
+        f"{prefix}traction": _variable(
+            ("component", *NODES), face.traction, "MPa", f"force on the layer {where} per reference area"
+        ),
+        f"{prefix}slip": _variable(("lateral", *NODES), face.slip, "mm", f"tangential slip {where}"),
+        f"{prefix}contact_status": _variable(
+            NODES,
+            status.astype(np.int8),
+            "1",
+            f"contact status {where}",
+            flag_values=np.array([NOT_CONVERGED, 0, 1, 2], np.int8),
+            flag_meanings="not_converged open stick slip",
+        ),
+    }
+
+
+def _image(solution: Solution) -> dict[str, Variable]:
+    grid = solution.thickness
+    y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")
+    outside = np.asarray(grid.mask)
+    pressure = _pressure_image(solution, x, y)
+    images = {
+        "thickness": _variable(
+            IMAGE, np.where(outside, np.nan, grid.values), "mm", "computed thickness of the loaded layer"
+        ),
+        "pressure_image": _variable(
+            IMAGE, np.where(outside, np.nan, pressure), "MPa", "contact pressure at the sample under each pixel"
+        ),
+    }
+    if isinstance(solution.load, Imprint):
+        given = solution.load.thickness
+        images["imposed_thickness"] = _variable(IMAGE, given.values, "mm", "thickness map that was pressed in")
+        images["missing"] = _variable(IMAGE, given.mask, "1", "pixels of that map that hold no measured data")
+    return images
+
+
+def _pressure_image(
+    solution: Solution, x: Float[np.ndarray, "my mx"], y: Float[np.ndarray, "my mx"]
+) -> Float[np.ndarray, "my mx"]:
+    lateral = np.asarray(solution.displacement[:2, -1])
+    if not np.isfinite(lateral).all():
+        return np.full(x.shape, np.nan)
+    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)[0]
+
+
+def _stats(stats: dict[str, Array]) -> dict[str, Variable]:
+    labelled: dict[str, Variable] = {}
+    for name, value in stats.items():
+        values = np.asarray(value)
+        dims = ("component",) if values.shape == (3,) else tuple(f"{name}_{axis}" for axis in range(values.ndim))
+        unit, long_name = _STATS.get(name, (None, name.replace("_", " ")))
+        labelled[name] = (dims, values, {"long_name": long_name} | ({} if unit is None else {"units": unit}))
+    return labelled
+
+
+def _record(solution: Solution) -> dict[str, Any]:
+    """Collect what made this result; only types that netCDF stores."""
+    palpation, load = solution.palpation, solution.load
+    record = {
+        "title": "Stress on the sample from the thickness of a soft layer",
+        "conventions": "mm, N, MPa; tension positive, contact pressure positive in compression; x along image "
+        "columns, y along image rows, z from the window to the sample",
+        "status": status_name(solution),
+        "status_message": status_message(solution),
+        "element": palpation.element,
+        "elements": np.array(palpation.elements),
+        "extent": np.asarray(palpation.extent),
+        "sides": json.dumps(dict(zip(("x0", "x1", "y0", "y1"), palpation.sides, strict=True))),
+        "layer": json.dumps(describe(palpation.layer)),
+        "window": json.dumps(describe(palpation.window)),
+        "sample": json.dumps(describe(palpation.sample)),
+        "load": json.dumps(describe(load)),
+        "inputs_sha256": inputs_hash(palpation=palpation, load=load),
+        **versions(),
+    }
+    if isinstance(load, Imprint):
+        record["thickness_steps"] = steps_as_json(load.thickness)
+    return record

@@ -1,0 +1,129 @@
+"""From a palpation and a load to the discrete problem: surfaces, supports and dead forces."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._checks import concrete
+from ..mechanics.face import FaceRule, area_vector, size, surface_tangents, tributary_area
+from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
+from ..mechanics.internal import layer_body
+from ..model import Bonded, Contact, Displacement, HeightField, Imprint, LayerMesh, Load, Palpation, Roller, Traction, height_field
+from .equilibrium import Problem, Supports
+
+
+def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceRule, approach: Array | None = None) -> Problem:
+    """Build the discrete problem.
+
+    Args:
+        palpation: The experiment.
+        load: The load at load fraction 1.
+        start: The load at fraction 0; None for the unloaded layer.
+        rule: Where contact is integrated.
+        approach: Shift of the sample surface towards the layer [mm], or None.
+
+    Raises:
+        ValueError: If load, start and the sample's support do not fit together.
+    """
+    check_compatible(palpation, load, start)
+    mesh = palpation.mesh()
+    material = palpation.layer.material
+    X = mesh.positions()
+    stiffness = (material.bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
+
+    def face(contact: Contact, surface: RigidSurface, above: bool, offset=0.0, imposed=None, rule=rule) -> ContactFace:
+        return ContactFace(contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule)
+
+    plane = RigidSurface(None, None)
+    window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
+    sample = dead = imposed = None
+    if isinstance(load, Imprint):
+        offset = palpation.sample.law.zero_pressure_clearance - (0.0 if approach is None else approach)
+        sample = face(palpation.sample, _imprint_surface(palpation, mesh, load, start), True, offset)
+    elif isinstance(load, Traction):
+        area = tributary_area(X[:, -1])
+        first, last = (_traction(end, mesh) for end in (start, load))
+        dead = (first * area, last * area)
+        if load.lateral is None:
+            _, xi, eta = surface_tangents(X[:, -1], "nodes")
+            pressure = ImposedPressure(-first[2], -last[2], size(area_vector(xi, eta)))
+            sample = face(palpation.sample, plane, True, imposed=pressure, rule="nodes")
+    else:
+        first, last = (_displacement(end, mesh) for end in (start, load))
+        imposed = (first, last)
+    return Problem(layer_body(mesh, material, palpation.element), X, window, sample, dead, imposed, _supports(palpation, load))
+
+
+def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
+    """Raise ValueError where load and sample contradict each other."""
+    if not isinstance(load, (Imprint, Traction, Displacement)):
+        raise ValueError(f"load must be Imprint, Traction or Displacement, got {type(load).__name__}.")
+    if start is not None and type(start) is not type(load):
+        raise ValueError(
+            f"A solve continues with the same kind of load: start has {type(start).__name__}, got {type(load).__name__}."
+        )
+    name = type(load).__name__
+    if isinstance(load, (Imprint, Traction)) and not isinstance(palpation.sample, Contact):
+        raise ValueError(
+            f"{name} needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}(). "
+            "For a prescribed interface use Displacement."
+        )
+    if isinstance(load, Displacement) and isinstance(palpation.sample, Contact):
+        friction = concrete(palpation.sample.friction)
+        if load.lateral == "free" and (friction is None or np.any(friction != 0)):
+            raise ValueError(
+                "Displacement(lateral='free') leaves the interface without friction, but sample.friction [-] is not "
+                "zero. Pass sample=Roller(), or press the shape in with Imprint."
+            )
+
+
+def _supports(palpation: Palpation, load: Load) -> Supports:
+    window = {Bonded: "bonded", Roller: "roller", Contact: "contact"}[type(palpation.window)]
+    if isinstance(load, Displacement):
+        interface = "bonded" if load.lateral == "fixed" else "uz"
+    else:
+        interface = "contact" if isinstance(load, Imprint) else "traction"
+    return Supports(window, interface, palpation.sides)
+
+
+def _imprint_surface(palpation: Palpation, mesh: LayerMesh, load: Imprint, start: Load | None) -> RigidSurface:
+    nx, ny, _ = mesh.elements
+    hx, hy = mesh.spacing
+    # The rigid body reaches half a field past the layer; beyond, it continues at its edge value.
+    beyond = (nx // 2 + 1, ny // 2 + 1)
+    columns = (jnp.arange(nx + 1 + 2 * beyond[0]) - beyond[0]) * hx
+    rows = (jnp.arange(ny + 1 + 2 * beyond[1]) - beyond[1]) * hy
+    y, x = jnp.meshgrid(rows, columns, indexing="ij")
+    origin, spacing = jnp.stack([columns[0], rows[0]]), jnp.stack([hx, hy])
+
+    def surface(values: Array) -> HeightField:
+        return height_field(values, origin, spacing, load.interpolation)
+
+    unloaded = palpation.layer.thickness_at(x, y)
+    first = start.thickness.sample(x, y) if isinstance(start, Imprint) else unloaded
+    return RigidSurface(surface(first), surface(load.thickness.sample(x, y)))
+
+
+def _traction(load: Traction | None, mesh: LayerMesh) -> Array:
+    shape = mesh.thickness.shape
+    if load is None:
+        return jnp.zeros((3, *shape), mesh.thickness.dtype)
+    normal = _on_nodes("Traction.normal", "MPa", load.normal, shape)
+    lateral = jnp.zeros((2, *shape), normal.dtype)
+    if load.lateral is not None:
+        if load.lateral.shape != (2, *shape):
+            raise ValueError(f"Traction.lateral [MPa] must be {(2, *shape)}, got {load.lateral.shape}.")
+        lateral = load.lateral
+    return jnp.concatenate([lateral, -normal[None]])
+
+
+def _displacement(load: Displacement | None, mesh: LayerMesh) -> Array:
+    if load is None:
+        return jnp.zeros_like(mesh.thickness)
+    return _on_nodes("Displacement.uz", "mm", load.uz, mesh.thickness.shape)
+
+
+def _on_nodes(field: str, unit: str, values: Array, shape: tuple[int, int]) -> Array:
+    if values.ndim and values.shape != shape:
+        raise ValueError(f"{field} [{unit}] must be a number or interface nodes (ny+1, nx+1) = {shape}, got {values.shape}.")
+    return jnp.broadcast_to(values, shape)

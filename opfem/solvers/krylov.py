@@ -1,0 +1,127 @@
+"""Flexible GMRES: the linear solver of one Newton step.
+
+Frictional contact makes the tangent non-symmetric, and its curvature can make it indefinite;
+the preconditioner is a symmetric positive V-cycle in float32. Restarted, with a fixed basis
+size, so that it runs under jit and vmap.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class KrylovResult(NamedTuple):
+    """Solution, relative residual estimate, and applications of the preconditioner."""
+
+    x: Array
+    relative_residual: Float[Array, ""]
+    iterations: Array
+
+
+class _Basis(NamedTuple):
+    V: Array  # (m + 1, n) orthonormal directions
+    Z: Array  # (m, n) preconditioned directions
+    R: Array  # (m, m) triangular factor, columns filled one by one
+    rotations: Array  # (2, m) Givens cosines and sines
+    g: Array  # (m + 1,) rotated right-hand side
+    j: Array
+
+
+def fgmres(
+    operator: Callable[[Array], Array],
+    preconditioner: Callable[[Array], Array],
+    b: Array,
+    rtol: Array,
+    basis: int,
+    max_iterations: int,
+) -> KrylovResult:
+    """Solve operator(x) = b to a residual of rtol × |b|.
+
+    Args:
+        operator: Linear map of an array of the shape of b.
+        preconditioner: Approximate inverse, in any precision.
+        b: Right-hand side.
+        rtol: Relative tolerance on the residual norm.
+        basis: Directions kept before a restart.
+        max_iterations: Most applications of the preconditioner; checked at restarts.
+
+    Source:
+        Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 9.6.
+    """
+    shape, n = b.shape, b.size
+    target = rtol * _norm(b)
+
+    def restart(carry):
+        x, r, iterations, _ = carry
+        beta = _norm(r)
+        start = _Basis(
+            V=jnp.zeros((basis + 1, n), b.dtype).at[0].set(r.reshape(-1) / jnp.where(beta > 0, beta, 1.0)),
+            Z=jnp.zeros((basis, n), jnp.float32),
+            R=jnp.eye(basis, dtype=b.dtype),
+            rotations=jnp.zeros((2, basis), b.dtype),
+            g=jnp.zeros(basis + 1, b.dtype).at[0].set(beta),
+            j=jnp.zeros((), int),
+        )
+        end = jax.lax.while_loop(
+            lambda s: (s.j < basis) & (jnp.abs(s.g[s.j]) > target), lambda s: _extend(s, operator, preconditioner, shape), start
+        )
+        # Columns not reached keep the identity and a zero right-hand side.
+        right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
+        y = _back_substitute(end.R, right)
+        x = x + (y.astype(jnp.float32) @ end.Z).reshape(shape).astype(b.dtype)
+        r = b - operator(x)
+        return x, r, iterations + end.j, _norm(r)
+
+    def unfinished(carry):
+        _, _, iterations, size = carry
+        return (size > 2.0 * target) & (iterations < max_iterations)
+
+    x, _, iterations, size = jax.lax.while_loop(unfinished, restart, (jnp.zeros_like(b), b, jnp.zeros((), int), _norm(b) + target))
+    norm = _norm(b)
+    return KrylovResult(x, size / jnp.where(norm > 0, norm, 1.0), iterations)
+
+
+def _extend(s: _Basis, operator, preconditioner, shape) -> _Basis:
+    j = s.j
+    z = preconditioner(s.V[j].reshape(shape)).astype(jnp.float32)
+    w = operator(z.astype(s.V.dtype)).reshape(-1)
+    h = s.V @ w
+    w = w - h @ s.V
+    again = s.V @ w  # classical Gram–Schmidt twice is as good as modified, and two matrix products
+    w = w - again @ s.V
+    size = _norm(w)
+    h = (h + again).at[j + 1].set(size)
+
+    def rotate(k, h):
+        c, sn = s.rotations[0, k], s.rotations[1, k]
+        turned = jnp.stack([c * h[k] + sn * h[k + 1], -sn * h[k] + c * h[k + 1]])
+        return jnp.where(k < j, jax.lax.dynamic_update_slice(h, turned, (k,)), h)
+
+    h = jax.lax.fori_loop(0, s.R.shape[0], rotate, h)
+    radius = jnp.sqrt(h[j] ** 2 + h[j + 1] ** 2)
+    radius = jnp.where(radius > 0, radius, 1.0)
+    c, sn = h[j] / radius, h[j + 1] / radius
+    column = jnp.where(jnp.arange(s.R.shape[0]) < j, h[:-1], 0.0).at[j].set(radius)
+    return _Basis(
+        V=s.V.at[j + 1].set(w / jnp.where(size > 0, size, 1.0)),
+        Z=s.Z.at[j].set(z.reshape(-1)),
+        R=s.R.at[:, j].set(column),
+        rotations=s.rotations.at[:, j].set(jnp.stack([c, sn])),
+        g=s.g.at[j + 1].set(-sn * s.g[j]).at[j].set(c * s.g[j]),
+        j=j + 1,
+    )
+
+
+def _back_substitute(R: Array, g: Array) -> Array:
+    def row(k, y):
+        i = R.shape[0] - 1 - k
+        return y.at[i].set((g[i] - R[i] @ y) / R[i, i])
+
+    return jax.lax.fori_loop(0, R.shape[0], row, jnp.zeros_like(g))
+
+
+def _norm(v: Array) -> Array:
+    return jnp.sqrt(jnp.vdot(v, v))

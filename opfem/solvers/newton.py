@@ -1,0 +1,161 @@
+"""Newton's method for one load increment, and its settings.
+
+Each step assembles the exact tangent, solves it by preconditioned GMRES and takes the largest of
+the steps 1, 1/2, 1/4, … that lowers the unbalanced force with no element inverted.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._checks import check_positive
+from .equilibrium import ContactIterates, Forces, Problem, State
+from .krylov import fgmres
+from .multigrid import apply_multigrid, build_multigrid
+from .stencil import Nodal, apply_stencil
+
+
+class Newton(eqx.Module):
+    """Implicit statics: load increments, Newton steps, multigrid-preconditioned Krylov solver.
+
+    The load is applied in `increments` equal parts. An increment that does not converge is cut
+    and repeated from the last converged state, its friction history restored; increments grow
+    again up to that size.
+
+    Args:
+        rtol: Unbalanced force over contact force [-] at convergence (Euclidean norms).
+        increments: Load increments when none is cut.
+        max_steps: Newton steps per increment before it is cut.
+        min_increment: Smallest load increment [-] before the solve gives up.
+        max_increments: Most increments tried, repeated ones included.
+        krylov_rtol: Relative tolerance of each linear solve.
+        krylov_steps: Most preconditioner applications per linear solve.
+        max_backtracks: Halvings of a Newton step before the increment is cut.
+        face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes".
+
+    Raises:
+        ValueError: If a number is not positive.
+    """
+
+    rtol: float = eqx.field(static=True, default=1e-7)
+    increments: int = eqx.field(static=True, default=8)
+    max_steps: int = eqx.field(static=True, default=20)
+    min_increment: float = eqx.field(static=True, default=1e-4)
+    max_increments: int = eqx.field(static=True, default=400)
+    krylov_rtol: float = eqx.field(static=True, default=1e-3)
+    krylov_steps: int = eqx.field(static=True, default=120)
+    max_backtracks: int = eqx.field(static=True, default=6)
+    cap: float = eqx.field(static=True, default=0.25)
+    far: float = eqx.field(static=True, default=0.3)
+    face_rule: str = eqx.field(static=True, default="gauss2")
+
+    def __check_init__(self):
+        for name in ("rtol", "increments", "max_steps", "min_increment", "max_increments", "krylov_rtol", "krylov_steps"):
+            check_positive(f"Newton.{name}", "-", getattr(self, name))
+        if self.face_rule not in ("gauss2", "gauss3", "nodes"):
+            raise ValueError(f'Newton.face_rule must be "gauss2", "gauss3" or "nodes", got {self.face_rule!r}.')
+
+
+class IncrementResult(NamedTuple):
+    """Outcome of one load increment; `state` is only meaningful when `converged`."""
+
+    state: State
+    converged: Array
+    steps: Array
+    krylov: Array
+    residual: Array  # relative to the force scale
+    smallest_J: Array
+    log: Array
+
+
+class _Iterate(NamedTuple):
+    u: Nodal
+    contact: ContactIterates
+    forces: Forces
+    size: Array
+    tolerance: Array
+    steps: Array
+    krylov: Array
+    log: Array
+
+
+def solve_increment(problem: Problem, state: State, guess: Nodal, fraction: Array, held: Array, settings: Newton) -> IncrementResult:
+    """Find equilibrium at a load fraction, from a converged state and a first guess."""
+
+    def merit(u, forces, contact):
+        r = problem.residual(problem.with_contact(forces, u, fraction, state, problem.soft_laws(contact)), held)
+        return _norm(r)
+
+    def evaluate(u):
+        forces = problem.forces(u, fraction, state)
+        size = _norm(problem.residual(forces, held))
+        size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
+        return forces, size, settings.rtol * problem.force_scale(forces)
+
+    def unfinished(it):
+        return (it.size > it.tolerance) & (it.steps < settings.max_steps) & jnp.isfinite(it.size)
+
+    def step(it):
+        settled = (it.size < settings.far / settings.rtol * it.tolerance) | (it.steps == 0)
+        laws = problem.tangent_laws(it.u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
+        S, guarded, scale = problem.tangent(it.u, fraction, state, laws)
+        free = problem.free
+        multigrid = build_multigrid(guarded, None if free.all() else free, scale)
+        r = problem.residual(problem.with_contact(it.forces, it.u, fraction, state, laws), held)
+        solution = fgmres(
+            lambda v: problem.project(apply_stencil(S, problem.project(v, held)), held),
+            lambda v: problem.project(apply_multigrid(multigrid, v), held),
+            -r,
+            jnp.asarray(settings.krylov_rtol, it.u.dtype),
+            basis=min(30, settings.krylov_steps),
+            max_iterations=settings.krylov_steps,
+        )
+        reach = jnp.sqrt(jnp.sum(solution.x**2, axis=0))
+        cap = settings.cap * jnp.min(problem.body.geometry.spacing)
+        limited = solution.x * jnp.minimum(1.0, cap / jnp.where(reach > 0, reach, 1.0))
+        direction = problem.project(limited, held) * free
+
+        def shorten(carry):
+            length, count, *_ = carry
+            length = jnp.where(count == 0, 1.0, 0.5 * length)
+            return length, count + 1, *evaluate(it.u + length * direction)
+
+        def unusable(carry):
+            return ~jnp.isfinite(carry[3]) & (carry[1] <= settings.max_backtracks)
+
+        start = (jnp.ones_like(it.size), 0, it.forces, jnp.full_like(it.size, jnp.inf), it.tolerance)
+        length, _, forces, size, tolerance = jax.lax.while_loop(unusable, shorten, start)
+        m0=merit(it.u,it.forces,it.contact); m1=merit(it.u + length * direction,forces,problem.follow(it.u, direction, fraction, state, laws, length))
+        m0=m0/tolerance * settings.rtol; m1=m1/tolerance * settings.rtol; dmax=jnp.max(jnp.abs(direction))
+        entry = jnp.stack([m0,m1,dmax,size / tolerance * settings.rtol, solution.iterations, length, solution.relative_residual])
+        return _Iterate(
+            u=it.u + length * direction,
+            contact=problem.follow(it.u, direction, fraction, state, laws, length),
+            forces=forces,
+            size=size,
+            tolerance=tolerance,
+            steps=it.steps + 1,
+            krylov=it.krylov + solution.iterations,
+            log=it.log.at[it.steps].set(entry),
+        )
+
+    u = problem.with_imposed(guess, fraction)
+    zero = jnp.zeros((), int)
+    first = _Iterate(u, problem.initial_iterates(state), *evaluate(u), zero, zero, jnp.zeros((settings.max_steps, 7), u.dtype))
+    end = jax.lax.while_loop(unfinished, step, first)
+    return IncrementResult(
+        state=problem.advance(end.u, fraction, state, held),
+        converged=end.size <= end.tolerance,
+        steps=end.steps,
+        krylov=end.krylov,
+        residual=end.size / end.tolerance * settings.rtol,
+        smallest_J=end.forces.smallest_J,
+        log=end.log,
+    )
+
+
+def _norm(r: Nodal) -> Array:
+    return jnp.sqrt(jnp.vdot(r, r))

@@ -1,0 +1,120 @@
+"""What a solve returns: fields, status and statistics."""
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+from ..measurement import ThicknessMap
+from ..model import Load, Palpation
+from .equilibrium import State
+
+OPEN, STICK, SLIP = 0, 1, 2
+
+
+class RESULTS(eqx.Enumeration):
+    """How a solve ended. Anything but `successful` and `slides_off` leaves NaN fields."""
+
+    successful = ""
+    slides_off = (
+        "Converged, but only because the in-plane hold carries a lateral force: friction cannot. "
+        "stats['force_hold'] says how much."
+    )
+    increment_too_small = (
+        "The load increment became smaller than Newton.min_increment without convergence. Smooth the map "
+        "(smoothed(fwhm=...)), use more elements, or raise Newton.max_steps; last_converged holds the last state."
+    )
+    max_increments_reached = (
+        "Newton.max_increments were tried before the load was reached. Raise it, or smooth the map; "
+        "last_converged holds the last state."
+    )
+    nonfinite = "The inputs lead to NaN or infinite forces. Check the map, the thickness and the material."
+
+
+class FaceResult(eqx.Module):
+    """What acts on one face of the layer, at its nodes `(ny+1, nx+1)`.
+
+    Attributes:
+        pressure: Contact pressure -n·σn on the current area [MPa], positive in compression.
+        traction: Force on the layer per reference area, x y z [MPa].
+        slip: Tangential slip along x and y against the body [mm].
+        status: 0 open, 1 stick, 2 slip.
+    """
+
+    pressure: Float[Array, "ny+1 nx+1"]
+    traction: Float[Array, "3 ny+1 nx+1"]
+    slip: Float[Array, "2 ny+1 nx+1"]
+    status: Int[Array, "ny+1 nx+1"]
+
+
+class LastConverged(eqx.Module):
+    """The last converged state of a solve.
+
+    Attributes:
+        displacement: `(3, nz+1, ny+1, nx+1)` [mm].
+        load_fraction: How much of the load it carries [-].
+        state: The same with its friction history, for `solve(..., start=)`.
+    """
+
+    displacement: Float[Array, "3 nz+1 ny+1 nx+1"]
+    load_fraction: Float[Array, ""]
+    state: State
+
+
+class Solution(eqx.Module):
+    """The solved palpation.
+
+    Attributes:
+        displacement: `(3, nz+1, ny+1, nx+1)` [mm].
+        positions: Reference positions of the nodes, same shape [mm].
+        sample: What acts at the sample–layer interface.
+        window: What acts at the window.
+        thickness: Deformed interface as a spatial map on the load's grid [mm], masked where no
+            interface point lies above.
+        stress_zz: Cauchy stress σ_zz, mean over each top element `(ny, nx)` [MPa].
+        stats: Iterations, residual, energies, forces [N]; see `solve`.
+        result: How the solve ended.
+        last_converged: The last converged state and its load fraction.
+        palpation: The experiment that was solved.
+        load: Its load.
+    """
+
+    displacement: Float[Array, "3 nz+1 ny+1 nx+1"]
+    positions: Float[Array, "3 nz+1 ny+1 nx+1"]
+    sample: FaceResult
+    window: FaceResult
+    thickness: ThicknessMap
+    stress_zz: Float[Array, "ny nx"]
+    stats: dict[str, Any]
+    result: RESULTS
+    last_converged: LastConverged
+    palpation: Palpation
+    load: Load
+
+    @property
+    def pressure(self) -> Float[Array, "ny+1 nx+1"]:
+        """Contact pressure on the sample [MPa], on the current area."""
+        return self.sample.pressure
+
+    @property
+    def traction(self) -> Float[Array, "3 ny+1 nx+1"]:
+        """Force on the layer at the interface per reference area [MPa]."""
+        return self.sample.traction
+
+    @property
+    def slip(self) -> Float[Array, "2 ny+1 nx+1"]:
+        """Slip of the interface along the sample [mm]."""
+        return self.sample.slip
+
+    @property
+    def contact_status(self) -> Int[Array, "ny+1 nx+1"]:
+        """Status of the interface: 0 open, 1 stick, 2 slip."""
+        return self.sample.status
+
+
+class ConvergenceError(RuntimeError):
+    """A solve did not reach its load. `solution` holds its status and last converged state."""
+
+    def __init__(self, message: str, solution: Solution):
+        super().__init__(message)
+        self.solution = solution

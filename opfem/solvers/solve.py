@@ -1,0 +1,159 @@
+"""`solve`: a palpation under a load, by implicit statics."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..model import Load, Palpation
+from .discretise import discretise
+from .equilibrium import Problem, State
+from .newton import Newton
+from .progress import LoadProgress
+from .recover import recover
+from .solution import RESULTS, ConvergenceError, LastConverged, Solution
+from .stepping import Stepping, attempt, begin, outcome, unfinished
+
+
+def solve(
+    palpation: Palpation,
+    load: Load,
+    solver: Newton = Newton(),
+    *,
+    throw: bool = True,
+    start: Solution | None = None,
+    progress: bool = True,
+) -> Solution:
+    """Solve a palpation under a load.
+
+    Args:
+        palpation: The experiment.
+        load: `Imprint`, `Traction` or `Displacement`.
+        solver: Method and settings.
+        throw: Raise where the solve fails. False: return NaN fields, the status in `result`
+            and the last converged state in `last_converged`.
+        start: Continue from this solution, with its friction history.
+        progress: Show a bar on a terminal or in a notebook; never inside jit.
+
+    Returns:
+        The solution. `stats` holds `newton_steps`, `krylov_steps`, `increments`, `attempts`,
+        `residual` (unbalanced force over contact force), `load_fraction`, `strain_energy` and
+        `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
+        the layer, `approach` and `max_penetration` [mm], `min_volume_ratio` [-].
+
+    Raises:
+        ValueError: If load and palpation contradict each other, or numbers are float32.
+        ConvergenceError: If the solve fails and `throw` is True.
+    """
+    _require_float64(palpation)
+    load_start = None if start is None else start.load
+    problem, initial = _prepare(palpation, load, load_start, solver, None if start is None else start.last_converged.state)
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, initial)))
+    run = _run_traced if traced else _run_with_progress
+    stepping = run(problem, initial, solver, progress)
+    if getattr(load, "correct_approach", False):
+        problem, stepping = _correct_approach(palpation, load, load_start, solver, problem, stepping, run, progress)
+    solution = _finish(problem, stepping, palpation, load)
+    return _raise_on_failure(solution, traced) if throw else solution
+
+
+@eqx.filter_jit
+def _prepare(palpation, load, load_start, solver, state: State | None) -> tuple[Problem, Stepping]:
+    problem = discretise(palpation, load, load_start, solver.face_rule)
+    if state is None:
+        state = problem.initial_state()
+    else:
+        state = eqx.tree_at(lambda s: s.fraction, state, jnp.zeros_like(state.fraction))
+    return problem, begin(state, solver)
+
+
+_attempt = eqx.filter_jit(attempt)
+
+
+def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
+    with LoadProgress(progress) as bar:
+        while bool(unfinished(stepping)):
+            stepping = _attempt(problem, stepping, solver)
+            bar.show(float(stepping.state.fraction), int(stepping.attempts), int(stepping.newton))
+    return stepping
+
+
+def _run_traced(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
+    return jax.lax.while_loop(unfinished, lambda s: attempt(problem, s, solver), stepping)
+
+
+def _correct_approach(palpation, load, load_start, solver, problem, stepping, run, progress) -> tuple[Problem, Stepping]:
+    """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
+    for _ in range(2):
+        approach = _approach(problem, stepping, load)
+        shifted = eqx.tree_at(lambda p: p.sample.offset, problem, palpation.sample.law.zero_pressure_clearance - approach)
+        # The surface is in place; what is left is one increment at the full load.
+        again = begin(stepping.state, solver)
+        before = eqx.tree_at(lambda s: s.fraction, stepping.state, jnp.zeros_like(stepping.state.fraction))
+        again = again._replace(
+            state=eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment), before=before,
+            can_release=stepping.can_release, release_failed=stepping.release_failed,
+        )
+        again = again._replace(before=again.state)
+        stepping_next = run(shifted, again, solver, progress)
+        totals = {name: getattr(stepping, name) + getattr(stepping_next, name) for name in ("attempts", "increments", "newton", "krylov")}
+        problem, stepping = shifted, stepping_next._replace(**totals)
+    return problem, stepping
+
+
+@eqx.filter_jit
+def _approach(problem: Problem, s: Stepping, load: Load) -> Array:
+    return recover(problem, s.before, s.state, load).stats["approach"]
+
+
+@eqx.filter_jit
+def _finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+    fields = recover(problem, s.before, s.state, load)
+    result = outcome(s)
+    ok = s.state.fraction >= 1.0
+    counts = {
+        "newton_steps": s.newton,
+        "krylov_steps": s.krylov,
+        "increments": s.increments,
+        "attempts": s.attempts,
+        "residual": s.residual,
+        "load_fraction": s.state.fraction,
+    }
+
+    def kept(field):
+        return jnp.where(ok, field, jnp.nan) if jnp.issubdtype(field.dtype, jnp.inexact) else field
+
+    public = jax.tree.map(kept, (s.state.u, fields.sample, fields.window, fields.stress_zz, fields.stats))
+    displacement, sample, window, stress_zz, stats = public
+    return Solution(
+        displacement=displacement,
+        positions=problem.positions,
+        sample=sample,
+        window=window,
+        thickness=eqx.tree_at(lambda m: m.values, fields.thickness, kept(fields.thickness.values)),
+        stress_zz=stress_zz,
+        stats={**counts, **stats},
+        result=result,
+        last_converged=LastConverged(s.state.u, s.state.fraction, s.state),
+        palpation=palpation,
+        load=load,
+    )
+
+
+def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
+    failed = (solution.result != RESULTS.successful) & (solution.result != RESULTS.slides_off)
+    if traced:
+        return solution.result.error_if(solution, failed)
+    if bool(failed):
+        reached = float(solution.last_converged.load_fraction)
+        raise ConvergenceError(f"The solve stopped at {reached:.1%} of the load. {RESULTS[solution.result]}", solution)
+    return solution
+
+
+def _require_float64(palpation: Palpation) -> None:
+    dtypes = {leaf.dtype for leaf in jax.tree.leaves(palpation) if eqx.is_inexact_array(leaf)}
+    if jnp.dtype("float32") in dtypes:
+        raise ValueError(
+            "Newton needs float64 numbers, got float32. Before building the layer, run "
+            'jax.config.update("jax_enable_x64", True) once.'
+        )

@@ -1,0 +1,97 @@
+"""The assembled tangent as a block stencil: 27 blocks of 3×3 per node, no scatter.
+
+Element matrices are `(nz, 8 a, 8 b, 3, 3, ny, nx)`; assembling overlaps them one axis after
+the other. `S[dz, 3 dy + dx, i, j]` couples component i of a node with component j of its
+neighbour at offset (dz - 1, dy - 1, dx - 1).
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..mechanics.hex8 import pad_axis
+
+Stencil = Float[Array, "3 9 3 3 nz+1 ny+1 nx+1"]
+ElementMatrices = Float[Array, "nz 8 8 3 3 ny nx"]
+Nodal = Float[Array, "3 nz+1 ny+1 nx+1"]
+
+_LATERAL = tuple(itertools.product(range(3), repeat=2))
+
+
+def assemble_stencil(K: ElementMatrices) -> Stencil:
+    """Overlap element matrices into the stencil."""
+    nz, *_, ny, nx = K.shape
+    K = K.reshape(nz, 2, 2, 2, 2, 2, 2, 3, 3, ny, nx)  # nz, az, ay, ax, bz, by, bx, i, k, ny, nx
+    S = overlap(K, a=3, b=6, cell=-1)  # dx, nz, az, ay, bz, by, i, k, ny, nx+1
+    S = overlap(S, a=3, b=5, cell=-2)  # dy, dx, nz, az, bz, i, k, ny+1, nx+1
+    S = overlap(S, a=3, b=4, cell=2)  # dz, dy, dx, nz+1, i, k, ny+1, nx+1
+    S = jnp.moveaxis(S, 3, 5)
+    return S.reshape(3, 9, *S.shape[3:])
+
+
+def overlap(K: Array, a: int, b: int, cell: int) -> Array:
+    """Turn pairs of cell ends (a, b) along one axis into node offsets -1, 0, +1, placed first."""
+    pair = {(i, j): jnp.take(jnp.take(K, j, axis=b), i, axis=a) for i in (0, 1) for j in (0, 1)}
+    if cell > 0:
+        cell -= sum(axis < cell for axis in (a, b))
+    return jnp.stack(
+        [
+            pad_axis(pair[1, 0], cell, (1, 0)),
+            pad_axis(pair[0, 0], cell, (0, 1)) + pad_axis(pair[1, 1], cell, (1, 0)),
+            pad_axis(pair[0, 1], cell, (0, 1)),
+        ]
+    )
+
+
+def apply_stencil(S: Stencil, u: Nodal) -> Nodal:
+    """Multiply the assembled matrix with a nodal field.
+
+    A loop over dz around an unrolled 9×3×3 sum runs at memory bandwidth and compiles in half
+    the time of the sum unrolled whole.
+    """
+    nz, ny, nx = u.shape[1:]
+    padded = jnp.pad(u, ((0, 0), (1, 1), (1, 1), (1, 1)))
+
+    def add_layer(dz, y):
+        layer = jax.lax.dynamic_slice_in_dim(padded, dz, nz, axis=1)
+        block = S[dz]
+        rows = [y[0], y[1], y[2]]
+        for k, (dy, dx) in enumerate(_LATERAL):
+            shifted = layer[:, :, dy : dy + ny, dx : dx + nx]
+            for i, j in itertools.product(range(3), repeat=2):
+                rows[i] = rows[i] + block[k, i, j] * shifted[j]
+        return jnp.stack(rows)
+
+    return jax.lax.fori_loop(0, 3, add_layer, jnp.zeros_like(u))
+
+
+def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
+    """Put `scale` on the diagonal of rows that are zero: held and ghost unknowns."""
+    eye = jnp.eye(3, dtype=S.dtype)[:, :, None, None, None]
+    centre = S[1, 4]
+    diagonal = jnp.stack([centre[i, i] for i in range(3)])
+    missing = jnp.where(diagonal == 0.0, scale, 0.0).astype(S.dtype)
+    centre = centre + eye * missing[:, None]
+    middle = jnp.concatenate([S[1, :4], centre[None], S[1, 5:]])
+    return jnp.stack([S[0], middle, S[2]])
+
+
+def held(K: ElementMatrices, free: Nodal) -> ElementMatrices:
+    """Zero rows and columns of held unknowns (free = 0) in element matrices."""
+    from ..mechanics.hex8 import gather
+
+    mask = jnp.moveaxis(gather(free.astype(K.dtype)), 2, 0)  # nz, a, i, ny, nx
+    return K * mask[:, :, None, :, None] * mask[:, None, :, None, :]
+
+
+def column_blocks(S: Stencil) -> Float[Array, "m m ny+1 nx+1"]:
+    """Collect each column's own matrix, m = 3 (nz+1) unknowns ordered (z, component)."""
+    nodes = S.shape[4]
+    blocks = 0.0
+    for dz in range(3):
+        places = jnp.eye(nodes, k=dz - 1, dtype=S.dtype)[:, None, :, None, None, None]
+        column = jnp.moveaxis(S[dz, 4], 2, 0)  # z, i, j, y, x
+        blocks = blocks + places * column[:, :, None, :]
+    return blocks.reshape(3 * nodes, 3 * nodes, *S.shape[5:])

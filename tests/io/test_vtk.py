@@ -1,0 +1,58 @@
+"""The deformed layer in a .vtu file."""
+
+import os
+
+import numpy as np
+import pytest
+import pyvista
+import tolerances as tol
+
+import opfem as op
+
+
+@pytest.fixture(scope="module")
+def written(solution, tmp_path_factory):
+    path = tmp_path_factory.mktemp("vtu") / "result.vtu"
+    op.write_vtu(op.to_xarray(solution), path)
+    return pyvista.read(path)
+
+
+def test_is_the_deformed_layer(written, solution):
+    assert written.n_cells == 6 * 6 * 2
+    assert set(written.celltypes) == {pyvista.CellType.HEXAHEDRON}
+    current = np.asarray(solution.positions + solution.displacement).reshape(3, -1).T
+    np.testing.assert_allclose(written.points, current, rtol=tol.ROUNDOFF, atol=tol.ROUNDOFF)
+    np.testing.assert_array_equal(written["displacement_mm"], np.asarray(solution.displacement).reshape(3, -1).T)
+
+
+def test_cells_are_right_side_out(written, solution):
+    """Volumes are positive, and their sum is that of the layer, compressed by a few per cent."""
+    volumes = written.compute_cell_sizes(length=False, area=False)["Volume"]
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(2.0 * 2.0 * 0.5, rel=0.1)
+
+
+def test_faces(written, solution):
+    top = np.isfinite(written["pressure_MPa"])
+    assert np.array_equal(written["pressure_MPa"][top].reshape(7, 7), solution.pressure)
+    assert np.array_equal(written["window_pressure_MPa"][:49].reshape(7, 7), solution.window.pressure)
+    assert np.array_equal(written["traction_MPa"][top].T.reshape(3, 7, 7), solution.traction)
+    assert np.array_equal(written["contact_status"][top].reshape(7, 7), solution.contact_status)
+    assert written["displacement_mm"][top, 2].max() < 0
+    np.testing.assert_array_equal(written.points[:49, 2] < 0.1, True)
+
+
+def test_stress_lies_in_the_top_cells(written, solution):
+    stress = written["stress_zz_MPa"].reshape(2, 6, 6)
+    assert np.isnan(stress[0]).all()
+    assert np.array_equal(stress[1], solution.stress_zz)
+    heights = written.cell_centers().points[:, 2].reshape(2, 6, 6)
+    assert (heights[1] > heights[0]).all()
+
+
+def test_errors(tmp_path, solution, failed_solution):
+    with pytest.raises(ValueError, match=r"writes \.vtu"):
+        op.write_vtu(op.to_xarray(solution), tmp_path / "a.vtk")
+    with pytest.raises(ValueError, match="needs a converged solution"):
+        op.write_vtu(op.to_xarray(failed_solution), tmp_path / "a.vtu")
+    assert os.listdir(tmp_path) == []
