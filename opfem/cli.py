@@ -5,6 +5,8 @@ It reads, solves and writes with the same public functions as a notebook, and sa
 
 import dataclasses
 import json
+import os
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,12 +26,12 @@ from .model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, La
 from .results import summary, summary_rows, to_xarray
 from .solvers import ConvergenceError, Newton, Solution, solve
 
-FINISHED = "result.nc"
-"""Written last: a folder that holds it holds a whole result."""
+FINISHED = "result.nc"  # Written last: a folder that holds it holds a whole result.
 FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", FINISHED)
 
 # The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
+INTERRUPTED = 130
 
 app = App(
     name="opfem",
@@ -117,7 +119,15 @@ def main(tokens: Sequence[str] | None = None) -> None:
     Args:
         tokens: Arguments; None takes those of the process.
     """
-    app(tokens)
+    try:
+        app(tokens)
+    except SystemExit as end:
+        if end.code == INTERRUPTED and tokens is None:
+            # With a computation in flight jaxlib crashes while the interpreter winds down.
+            for stream in (sys.stdout, sys.stderr):
+                stream.flush()
+            os._exit(INTERRUPTED)
+        raise
 
 
 @app.command
@@ -153,8 +163,9 @@ def palpate(
         if map == "example":
             write_thickness(measured, out / "example_map.npz")
         _show_assumptions(palpation, load, layer, contact)
+        solver = Newton() if run.increments is None else Newton(increments=run.increments)
         try:
-            solution = solve(palpation, load, _solver(run))
+            solution = solve(palpation, load, solver)
         except ConvergenceError as failure:
             _remove(out)
             _write_summary(failure.solution, settings, out)
@@ -214,7 +225,8 @@ def state_experiment(
     extent = _layer_extent(measured, layer)
     fwhm = reading.smooth
     if fwhm is None:
-        fwhm = 0.5 * min(extent[0] / layer.elements[0], extent[1] / layer.elements[1])
+        # Palpation refuses elements below 1, after this.
+        fwhm = 0.5 * min(length / max(count, 1) for length, count in zip(extent, layer.elements[:2], strict=True))
     if isinstance(unloaded, ThicknessMap):
         unloaded = _ready(unloaded, fwhm)
     palpation = Palpation(
@@ -259,7 +271,7 @@ def _reporting(debug: bool) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         _complain("Interrupted; no file was left half-written.")
-        raise SystemExit(130) from None
+        raise SystemExit(INTERRUPTED) from None
     except Exception as cause:
         if debug:
             raise
@@ -306,10 +318,9 @@ def _layer_extent(measured: ThicknessMap, options: LayerOptions) -> tuple[float,
     if options.layer_extent is not None:
         return options.layer_extent
     if np.any(measured.origin):
-        start = tuple(measured.origin.tolist())
-        raise ValueError(f"The map starts at (x, y) = {start} mm, the layer at (0, 0). Pass --layer-extent LX LY.")
-    Lx, Ly = measured.extent.tolist()
-    return Lx, Ly
+        start = measured.origin.tolist()
+        raise ValueError(f"The map starts at x, y = {start} mm, the layer at 0, 0. Pass --layer-extent LX LY.")
+    return float(measured.extent[0]), float(measured.extent[1])
 
 
 def _material(options: LayerOptions) -> MooneyRivlin:
@@ -342,10 +353,6 @@ def _smoothing(thickness: ThicknessMap) -> list[float]:
     return [float(step.numbers["fwhm"]) for step in thickness.steps if step.name == "smoothed"]
 
 
-def _solver(options: RunOptions) -> Newton:
-    return Newton() if options.increments is None else Newton(increments=options.increments)
-
-
 def _write_summary(solution: Solution, settings: dict[str, Any], out: Path) -> None:
     with whole_file(out / "summary.json") as temporary:
         text = json.dumps({**summary(solution), "settings": settings}, indent=2, ensure_ascii=False)
@@ -374,8 +381,7 @@ def _show_assumptions(palpation: Palpation, load: Imprint, layer: LayerOptions, 
     for name, value in rows.items():
         table.add_row(name, value)
     console = Console(highlight=False)
-    console.print("Solving for the stress on the sample, with")
-    console.print(table)
+    console.print("Solving for the stress on the sample, with", table, sep="\n")
     if published:
         console.print(f"  Assumed: {', '.join(published)} of the published deck's layer. Is it yours?")
 

@@ -2,12 +2,18 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jaxtyping
+import numpy as np
 import pytest
 
 jaxtyping.install_import_hook("opfem", "beartype.beartype")
 jax.config.update("jax_enable_x64", True)
+
+# After the hook, which checks only what is imported later.
+import opfem as op  # noqa: E402
 
 
 @pytest.fixture(scope="session")
@@ -20,30 +26,8 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def solve_small():
-    """Solve a 2 × 2 mm layer on 6 × 6 × 2 elements under a loaded thickness map [mm]; every use shares one compilation."""
-    import opfem as op
-
-    def solve(loaded, **options):
-        palpation = op.Palpation(
-            op.Layer(0.5, op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=0.11732)),
-            extent=(2.0, 2.0),
-            elements=(6, 6, 2),
-            window=op.Contact(op.HardOverclosure(), friction=0.15),
-            sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), friction=0.05),
-        )
-        return op.solve(palpation, op.Imprint(loaded), **options)
-
-    return solve
-
-
-@pytest.fixture(scope="session")
 def loaded():
     """A gentle bump pressed 13% into a 0.5 mm layer, off centre, with one missing pixel that is filled."""
-    import numpy as np
-
-    import opfem as op
-
     x, y = np.meshgrid(np.linspace(0.0, 2.0, 21), np.linspace(0.0, 2.0, 17))
     thickness = 0.5 * (1 - 0.07 - 0.06 * np.exp(-((x - 1.2) ** 2 + (y - 0.8) ** 2) / 0.3))
     mask = np.zeros(x.shape, bool)
@@ -52,14 +36,31 @@ def loaded():
 
 
 @pytest.fixture(scope="session")
-def solution(solve_small, loaded):
-    """A frictional solution that converged."""
-    return solve_small(loaded)
+def solution(loaded):
+    """The bump pressed into a 2 × 2 mm layer on 6 × 6 × 2 elements, with friction on both sides."""
+    palpation = op.Palpation(
+        op.Layer(0.5, op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=0.11732)),
+        extent=(2.0, 2.0),
+        elements=(6, 6, 2),
+        window=op.Contact(op.HardOverclosure(), friction=0.15),
+        sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), friction=0.05),
+    )
+    return op.solve(palpation, op.Imprint(loaded))
 
 
 @pytest.fixture(scope="session")
-def failed_solution(solve_small, loaded):
-    """A solve that failed: the map leaves 2% of the layer."""
-    import equinox as eqx
+def failed_solution(solution):
+    """What `solve(throw=False)` returns when it stops at 40% of the load: NaN in every public field."""
 
-    return solve_small(eqx.tree_at(lambda m: m.values, loaded, 0.0 * loaded.values + 0.01), throw=False)
+    def unknown(leaf):
+        return jnp.full_like(leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf
+
+    def public(s):
+        return [s.displacement, s.sample, s.window, s.thickness.values, s.stress_zz, s.stats]
+
+    failed = eqx.tree_at(public, solution, jax.tree.map(unknown, public(solution)))
+    return eqx.tree_at(
+        lambda s: (s.result, s.last_converged.load_fraction, s.stats["load_fraction"]),
+        failed,
+        (op.RESULTS.increment_too_small, jnp.asarray(0.4), jnp.asarray(0.4)),
+    )

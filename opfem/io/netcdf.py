@@ -27,9 +27,10 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike) -> None:
     if not isinstance(dataset, xr.Dataset):
         raise ValueError(f"write_netcdf takes a dataset, got {type(dataset).__name__}. Pass to_xarray(solution).")
     numeric = [name for name, values in dataset.variables.items() if values.ndim and values.dtype.kind in "fiub"]
-    encoding = {name: {**dataset[name].encoding, **_COMPRESSION} for name in numeric}
+    encoding = dict.fromkeys(numeric, _COMPRESSION)
     with whole_file(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+        # What another file stored by is not how this one is to be stored.
+        dataset.drop_encoding().to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
 
 def read_netcdf(path: str | os.PathLike) -> xr.Dataset:

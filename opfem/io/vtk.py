@@ -64,7 +64,7 @@ def _point_arrays(dataset: xr.Dataset, displacement: np.ndarray) -> dict[str, np
     return arrays
 
 
-def _on_layer(values: np.ndarray, layers: int, top: bool, elsewhere: float) -> np.ndarray:
+def _on_layer(values: np.ndarray, layers: int, top: bool, elsewhere: float | int) -> np.ndarray:
     """Spread the values of the top or bottom layer over all layers, and flatten, x fastest."""
     spread = np.full((layers, *values.shape), elsewhere, values.dtype)
     spread[-1 if top else 0] = values

@@ -42,26 +42,26 @@ def quadrature(rule: FaceRule) -> Quadrature:
     return Quadrature(N, np.stack([d_xi, d_eta], axis=1), (wy * wx).ravel())
 
 
-def gather_face(values: Float[Array, "c ny+1 nx+1"]) -> Float[Array, "4 c ny nx"]:
+def gather_face(values: Float[Array, "c my mx"]) -> Float[Array, "4 c ny nx"]:
     """Collect the nodal values of every face."""
     ny, nx = values.shape[1] - 1, values.shape[2] - 1
     return jnp.stack([values[:, y : y + ny, x : x + nx] for x, y in _CORNERS])
 
 
-def assemble_face(values: Float[Array, "4 *c ny nx"]) -> Float[Array, "*c ny+1 nx+1"]:
+def assemble_face(values: Float[Array, "4 *c ny nx"]) -> Float[Array, "*c my mx"]:
     """Add face nodal values into nodes."""
     pairs = values.reshape(2, 2, *values.shape[1:])
     rows = shifted_sum(pairs[:, 0], pairs[:, 1], axis=-1)
     return shifted_sum(rows[0], rows[1], axis=-2)
 
 
-def to_nodes(values: Float[Array, "points *c ny nx"], rule: FaceRule) -> Float[Array, "*c ny+1 nx+1"]:
+def to_nodes(values: Float[Array, "points *c ny nx"], rule: FaceRule) -> Float[Array, "*c my mx"]:
     """Integrate a density per unit of (ξ, η) against the nodal shape functions."""
     q = quadrature(rule)
     return assemble_face(contract((q.N * q.weights[:, None]).T, values))
 
 
-def surface_tangents(x: Float[Array, "3 ny+1 nx+1"], rule: FaceRule) -> tuple[Array, Array, Array]:
+def surface_tangents(x: Float[Array, "3 my mx"], rule: FaceRule) -> tuple[Array, Array, Array]:
     """Compute position and tangents dx/dξ, dx/dη at the points, each `(3, points, ny, nx)`."""
     q = quadrature(rule)
     both = np.concatenate([q.N[:, None], q.dN], axis=1)
@@ -75,13 +75,13 @@ def area_vector(xi: Float[Array, "3 *points"], eta: Float[Array, "3 *points"]) -
     return jnp.stack([xi[(k + 1) % 3] * eta[(k + 2) % 3] - xi[(k + 2) % 3] * eta[(k + 1) % 3] for k in range(3)])
 
 
-def nodal_area_vector(x: Float[Array, "3 ny+1 nx+1"]) -> Float[Array, "3 ny+1 nx+1"]:
+def nodal_area_vector(x: Float[Array, "3 my mx"]) -> Float[Array, "3 my mx"]:
     """Integrate n da against the nodal shape functions [mm²]."""
     _, xi, eta = surface_tangents(x, "gauss2")
     return to_nodes(jnp.moveaxis(area_vector(xi, eta), 1, 0), "gauss2")
 
 
-def tributary_area(x: Float[Array, "3 ny+1 nx+1"]) -> Float[Array, "ny+1 nx+1"]:
+def tributary_area(x: Float[Array, "3 my mx"]) -> Float[Array, "my mx"]:
     """Compute each node's share of the area [mm²], lumped at the nodes."""
     _, xi, eta = surface_tangents(x, "nodes")
     return to_nodes(size(area_vector(xi, eta)), "nodes")

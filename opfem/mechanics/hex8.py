@@ -33,13 +33,13 @@ def shape_gradients(points: np.ndarray) -> np.ndarray:
 GRADIENTS = shape_gradients(GAUSS_POINTS)
 
 
-def gather(u: Float[Array, "c nz+1 ny+1 nx+1"]) -> Float[Array, "8 c nz ny nx"]:
+def gather(u: Float[Array, "c mz my mx"]) -> Float[Array, "8 c nz ny nx"]:
     """Collect the nodal values of every element."""
     nz, ny, nx = (n - 1 for n in u.shape[1:])
     return jnp.stack([u[:, z : z + nz, y : y + ny, x : x + nx] for x, y, z in CORNERS])
 
 
-def assemble(f: Float[Array, "8 c nz ny nx"]) -> Float[Array, "c nz+1 ny+1 nx+1"]:
+def assemble(f: Float[Array, "8 c nz ny nx"]) -> Float[Array, "c mz my mx"]:
     """Add element nodal values into nodes: the transpose of `gather`."""
     f = f.reshape((2, 2, 2, *f.shape[1:]))
     f = shifted_sum(f[:, :, 0], f[:, :, 1], axis=-1)

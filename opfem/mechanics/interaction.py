@@ -17,7 +17,7 @@ from ..model import Contact, HeightField
 from .face import FaceRule, area_vector, gather_face, quadrature, size, surface_tangents, to_nodes
 from .kinematics import contract
 
-Face = Float[Array, "3 ny+1 nx+1"]
+Face = Float[Array, "3 my mx"]
 PointVector = Float[Array, "3 points ny nx"]
 
 
@@ -119,8 +119,8 @@ class ImposedPressure(eqx.Module):
         area: Reference area per unit of (ξ, η) at the points [mm²].
     """
 
-    start: Float[Array, "ny+1 nx+1"]
-    end: Float[Array, "ny+1 nx+1"]
+    start: Float[Array, "my mx"]
+    end: Float[Array, "my mx"]
     area: Float[Array, "points ny nx"]
 
     def at_points(self, fraction: Array, rule: FaceRule) -> Float[Array, "points ny nx"]:
@@ -212,15 +212,6 @@ class ContactFace(eqx.Module):
         # open half of a face at the first micrometre of error.
         closed = (pressure - self.stiffness * (clearance - at) >= 0) & (slope < 0)
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
-
-    def soft_law(self, iterate: ContactIterate) -> TangentLaw:
-        """Measure pressure and clearance against each other with the stiffness of one element.
-
-        What is left of contact in the merit of a step: stiff laws would let no step pass that
-        follows a curved surface.
-        """
-        at = self.contact.law.clearance(iterate.pressure, self.stiffness)
-        return TangentLaw(iterate.pressure, at, -self.stiffness * jnp.ones_like(at), jnp.zeros(at.shape, bool))
 
     def follow(self, fraction: Array, x: Face, change: Face, history: SlipHistory, law: TangentLaw, length: Array) -> ContactIterate:
         """Compute what the next iteration remembers after a step of `length` along `change`.

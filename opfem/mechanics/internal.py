@@ -31,14 +31,14 @@ class LayerBody(eqx.Module):
     geometry: ElementGeometry
     form: ElementForm = eqx.field(static=True)
 
-    def energy(self, u: Float[Array, "3 nz+1 ny+1 nx+1"]) -> Float[Array, ""]:
+    def energy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, ""]:
         """Compute the strain energy [N mm]."""
         k = kinematics(displacement_gradient(self.geometry, gather(u)))
         change = self._volume_change(k)
         density = self.material.isochoric_energy(k) + self.material.volumetric_energy(change)
         return jnp.sum(density * self.geometry.weight)
 
-    def internal_force(self, u: Float[Array, "3 nz+1 ny+1 nx+1"]) -> tuple[Float[Array, "3 nz+1 ny+1 nx+1"], Array]:
+    def internal_force(self, u: Float[Array, "3 mz my mx"]) -> tuple[Float[Array, "3 mz my mx"], Array]:
         """Compute dEnergy/du [N] and the smallest J of any Gauss point."""
         k = kinematics(displacement_gradient(self.geometry, gather(u)))
         P = self.material.first_piola(k, self.material.volumetric_stress(self._volume_change(k)))
@@ -47,7 +47,7 @@ class LayerBody(eqx.Module):
         nodal = contract(_FROM_POINTS, by_point.reshape(24, *by_point.shape[2:]))
         return assemble(nodal), jnp.min(k.J)
 
-    def stiffness(self, u: Float[Array, "3 nz+1 ny+1 nx+1"]) -> Float[Array, "nz 8 8 3 3 ny nx"]:
+    def stiffness(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "nz 8 8 3 3 ny nx"]:
         """Compute the element stiffness [N/mm]: K[a, b, i, k] = df[a, i]/du[b, k].
 
         One layer of elements at a time, so that the tangent moduli stay in the cache.
@@ -88,7 +88,7 @@ class LayerBody(eqx.Module):
         weight = (geometry or self.geometry).weight
         return jnp.sum(k.volume_change * weight, axis=0) / jnp.sum(weight, axis=0)
 
-    def cauchy(self, u: Float[Array, "3 nz+1 ny+1 nx+1"]) -> Float[Array, "3 3 8 nz ny nx"]:
+    def cauchy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "3 3 8 nz ny nx"]:
         """Compute Cauchy stress [MPa] at the Gauss points, tension positive."""
         k = kinematics(displacement_gradient(self.geometry, gather(u)))
         P = self.material.first_piola(k, self.material.volumetric_stress(self._volume_change(k)))

@@ -33,16 +33,16 @@ class ElementGeometry(eqx.Module):
         """Reference volume of the Gauss points [mm³]."""
         return self.depth * (self.spacing[0] * self.spacing[1] / 8.0)
 
-    def from_reference(self, gradient: Float[Array, "8 3 c nz ny nx"]) -> Float[Array, "c 3 8 nz ny nx"]:
-        """Turn d/dξ into d/dX."""
+    def from_reference(self, gradient: Array) -> Array:
+        """Turn d/dξ `(8, 3, c, nz, ny, nx)` into d/dX `(c, 3, 8, nz, ny, nx)`."""
         xi, eta, zeta = gradient[:, 0], gradient[:, 1], gradient[:, 2]
         sx, sy = self.slope_x[:, None], self.slope_y[:, None]
         d_dx = (xi - sx * zeta) / self.spacing[0]
         d_dy = (eta - sy * zeta) / self.spacing[1]
         return jnp.moveaxis(jnp.stack([d_dx, d_dy, zeta / self.depth[:, None]]), 2, 0)
 
-    def to_reference(self, flux: Float[Array, "c 3 8 nz ny nx"], axis: int = 1) -> Float[Array, "c 3 8 nz ny nx"]:
-        """Turn a flux along X into one along ξ (the transpose of `from_reference`)."""
+    def to_reference(self, flux: Array, axis: int = 1) -> Array:
+        """Turn a flux along X `(…, 8, nz, ny, nx)`, X at `axis`, into one along ξ: `from_reference` transposed."""
         x, y, z = (jnp.take(flux, k, axis=axis) for k in range(3))
         x, y = x / self.spacing[0], y / self.spacing[1]
         return jnp.stack([x, y, z / self.depth - self.slope_x * x - self.slope_y * y], axis=axis)

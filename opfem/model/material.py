@@ -89,7 +89,7 @@ class AbstractMaterial(eqx.Module):
         """Compute dU/dJ [MPa] from J - 1: the mean Cauchy stress."""
         return self.bulk * volume_change
 
-    def first_piola(self, k: Kinematics, mean_stress: Float[Array, "*points"]) -> Tensor:
+    def first_piola(self, k: Kinematics, mean_stress: Array) -> Tensor:
         """Compute the first Piola–Kirchhoff stress [MPa].
 
         Args:
@@ -102,7 +102,7 @@ class AbstractMaterial(eqx.Module):
         a, b, D, pull = self._terms(k)
         return 2.0 * (a * k.F + b * D) + (mean_stress * k.J - pull) * k.G
 
-    def tangent(self, k: Kinematics, mean_stress: Float[Array, "*points"]) -> Float[Array, "3 3 3 3 *points"]:
+    def tangent(self, k: Kinematics, mean_stress: Array) -> Float[Array, "3 3 3 3 *points"]:
         """Compute A[i, J, k, L] = dP[i, J]/dF[k, L] [MPa] at constant dU/dJ.
 
         The stiffness of U itself, U'' cof F ⊗ cof F, is left to the element form: it acts on
@@ -192,7 +192,7 @@ class NeoHooke(AbstractMaterial):
         return self.c10, jnp.zeros_like(self.c10)
 
 
-def identity_like(F: Tensor) -> Tensor:
+def identity_like(F: Tensor) -> Array:
     """Build the identity with trailing axes of size one."""
     return jnp.eye(3, dtype=F.dtype).reshape((3, 3) + (1,) * (F.ndim - 2))
 

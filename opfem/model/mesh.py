@@ -18,7 +18,7 @@ class LayerMesh(eqx.Module):
         layers: nz, elements through the thickness.
     """
 
-    thickness: Float[Array, "ny+1 nx+1"]
+    thickness: Float[Array, "my mx"]
     extent: Float[Array, "2"]
     layers: int = eqx.field(static=True)
 
@@ -45,14 +45,14 @@ class LayerMesh(eqx.Module):
         hx, hy = self.spacing
         return jnp.sqrt(hx * hy)
 
-    def plane(self) -> tuple[Float[Array, "ny+1 nx+1"], Float[Array, "ny+1 nx+1"]]:
+    def plane(self) -> tuple[Float[Array, "my mx"], Float[Array, "my mx"]]:
         """Compute reference x and y [mm] of the interface nodes."""
         nx, ny, _ = self.elements
         hx, hy = self.spacing
         y, x = jnp.meshgrid(hy * jnp.arange(ny + 1), hx * jnp.arange(nx + 1), indexing="ij")
         return x, y
 
-    def positions(self) -> Float[Array, "3 nz+1 ny+1 nx+1"]:
+    def positions(self) -> Float[Array, "3 mz my mx"]:
         """Compute the reference positions X [mm] of all nodes."""
         x, y = self.plane()
         fraction = jnp.arange(self.layers + 1)[:, None, None] / self.layers

@@ -28,6 +28,9 @@ class Palpation(eqx.Module):
         sample: The same at the sample–layer interface.
         sides: "free", "roller", or a dict of these by x0, x1, y0, y1 (missing ones are free).
         element: "mean_dilatation" (locking-free) or "full" (plain 2×2×2).
+        hold: What keeps a layer in place that friction cannot. None: its mean in-plane motion and
+            rotation at the window are held, until friction can carry what the hold carries. A number
+            [N/mm]: a uniform in-plane spring under the whole layer instead, so that it can drift.
 
     Raises:
         ValueError: If an argument is out of range or unknown.
@@ -40,6 +43,7 @@ class Palpation(eqx.Module):
     sample: Side
     sides: tuple[str, str, str, str] = eqx.field(static=True)
     element: Literal["mean_dilatation", "full"] = eqx.field(static=True)
+    hold: Array | None
 
     def __init__(
         self,
@@ -49,7 +53,8 @@ class Palpation(eqx.Module):
         window: Side,
         sample: Side,
         sides: str | Mapping[str, str] = "free",
-        element: str = "mean_dilatation",
+        element: Literal["mean_dilatation", "full"] = "mean_dilatation",
+        hold=None,
     ):
         if not isinstance(layer, Layer):
             raise ValueError(f"Palpation.layer must be a Layer, got {type(layer).__name__}.")
@@ -64,6 +69,8 @@ class Palpation(eqx.Module):
                 raise ValueError(f"Palpation.{name} must be Bonded(), Roller() or Contact(law, friction), got {side!r}.")
         if element not in ELEMENTS:
             raise ValueError(f"Palpation.element must be one of {ELEMENTS}, got {element!r}.")
+        if hold is not None:
+            check_positive("Palpation.hold", "N/mm", hold)
         self.layer = layer
         self.extent = as_leaf(jnp.asarray(extent))
         self.elements = counts
@@ -71,6 +78,7 @@ class Palpation(eqx.Module):
         self.sample = sample
         self.sides = _sides(sides)
         self.element = element
+        self.hold = None if hold is None else as_leaf(hold)
 
     def mesh(self) -> LayerMesh:
         """Build the mesh, with the layer's thickness sampled at its nodes."""

@@ -51,7 +51,12 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     else:
         first, last = (_displacement(end, mesh) for end in (start, load))
         imposed = (first, last)
-    return Problem(layer_body(mesh, material, palpation.element), X, window, sample, dead, imposed, _supports(palpation, load))
+    spring = None
+    if palpation.hold is not None:
+        share = tributary_area(X[:, 0])
+        spring = palpation.hold * share / jnp.sum(share)
+    body = layer_body(mesh, material, palpation.element)
+    return Problem(body, X, window, sample, dead, imposed, spring, _supports(palpation, load))
 
 
 def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
@@ -83,7 +88,7 @@ def _supports(palpation: Palpation, load: Load) -> Supports:
         interface = "bonded" if load.lateral == "fixed" else "uz"
     else:
         interface = "contact" if isinstance(load, Imprint) else "traction"
-    return Supports(window, interface, palpation.sides)
+    return Supports(window, interface, palpation.sides, palpation.hold is not None)
 
 
 def _imprint_surface(palpation: Palpation, mesh: LayerMesh, load: Imprint, start: Load | None) -> RigidSurface:

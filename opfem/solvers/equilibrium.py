@@ -24,6 +24,7 @@ class Supports(NamedTuple):
     window: str  # "contact", "roller" or "bonded"
     interface: str  # "contact", "traction", "uz" or "bonded"
     sides: tuple[str, str, str, str]
+    spring: bool  # an in-plane spring holds the window face
 
     def free(self, node_shape: tuple[int, int, int]) -> np.ndarray:
         """Build the mask of unknowns, 1 where free, `(3, nz+1, ny+1, nx+1)`."""
@@ -42,7 +43,7 @@ class Supports(NamedTuple):
     @property
     def drifts(self) -> tuple[bool, bool, bool]:
         """Rigid in-plane motions that only friction resists: along x, along y, about z."""
-        if "bonded" in (self.window, self.interface):
+        if self.spring or "bonded" in (self.window, self.interface):
             return (False, False, False)
         x = "roller" not in self.sides[:2]
         y = "roller" not in self.sides[2:]
@@ -71,8 +72,9 @@ class Forces(NamedTuple):
     """Nodal forces on the layer [N] at one state, and the smallest volume ratio."""
 
     internal: Nodal
-    sample: Float[Array, "3 ny+1 nx+1"]
-    window: Float[Array, "3 ny+1 nx+1"]
+    sample: Float[Array, "3 my mx"]
+    window: Float[Array, "3 my mx"]
+    spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
 
 
@@ -99,6 +101,7 @@ class Problem(eqx.Module):
     sample: ContactFace | None
     dead: tuple[Array, Array] | None  # nodal force at the interface [N], at fraction 0 and 1
     imposed: tuple[Array, Array] | None  # u_z at the interface [mm], at fraction 0 and 1
+    spring: Array | None  # in-plane stiffness under each node of the window face [N/mm]
     supports: Supports = eqx.field(static=True)
 
     @property
@@ -109,7 +112,9 @@ class Problem(eqx.Module):
     def forces(self, u: Nodal, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
         internal, smallest_J = self.body.internal_force(u)
-        return self.with_contact(Forces(internal, internal[:, -1], internal[:, 0], smallest_J), u, fraction, state, TangentLaws(None, None))
+        spring = None if self.spring is None else -self.spring * u[:2, 0]
+        forces = Forces(internal, internal[:, -1], internal[:, 0], spring, smallest_J)
+        return self.with_contact(forces, u, fraction, state, TangentLaws(None, None))
 
     def with_contact(self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: TangentLaws) -> Forces:
         """Replace the applied forces by those of the given laws; None means the contact's own."""
@@ -131,11 +136,6 @@ class Problem(eqx.Module):
             for face, history, iterate, layer in self._faces(state, iterates)
         ]
         return TangentLaws(*laws)
-
-    def soft_laws(self, iterates: ContactIterates) -> TangentLaws:
-        """Build the laws that the merit of a step is measured with."""
-        faces = (self.window, self.sample)
-        return TangentLaws(*(None if face is None else face.soft_law(it) for face, it in zip(faces, iterates, strict=True)))
 
     def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: TangentLaws, length: Array) -> ContactIterates:
         """Compute what the next iteration remembers after a step of `length` along `change`."""
@@ -166,8 +166,11 @@ class Problem(eqx.Module):
 
     def _unbalanced(self, forces: Forces) -> Nodal:
         nz = forces.internal.shape[1] - 1
+        window = forces.window
+        if forces.spring is not None:
+            window = window + jnp.concatenate([forces.spring, jnp.zeros_like(forces.spring[:1])])
         applied = jnp.concatenate(
-            [forces.window[:, None], jnp.zeros_like(forces.internal[:, 1:nz]), forces.sample[:, None]], axis=1
+            [window[:, None], jnp.zeros_like(forces.internal[:, 1:nz]), forces.sample[:, None]], axis=1
         )
         return forces.internal - applied
 
@@ -185,7 +188,7 @@ class Problem(eqx.Module):
         floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(applied + floor**2)
 
-    def drift_modes(self) -> list[Float[Array, "2 ny+1 nx+1"]]:
+    def drift_modes(self) -> list[Float[Array, "2 my mx"]]:
         """Build orthonormal rigid motions of the window face that no support prevents.
 
         Weighted by area: what they measure is the mean in-plane motion of the face.
@@ -211,8 +214,10 @@ class Problem(eqx.Module):
         bottom = jnp.concatenate([face, r[2:, 0]])
         return jnp.concatenate([bottom[:, None], r[:, 1:]], axis=1)
 
-    def hold_force(self, forces: Forces, held: Array) -> Float[Array, "2 ny+1 nx+1"]:
+    def hold_force(self, forces: Forces, held: Array) -> Float[Array, "2 my mx"]:
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
+        if forces.spring is not None:
+            return forces.spring
         unbalanced = (self.free * self._unbalanced(forces))[:2, 0]
         modes = self.drift_modes()
         if not modes:
@@ -236,20 +241,22 @@ class Problem(eqx.Module):
         hx, hy = self.body.geometry.spacing
         depth = jnp.mean(self.body.geometry.depth)
         scale = self.body.material.shear * hx * hy / depth
-        if any(self.supports.drifts):
+        if self.spring is not None:
+            K = _add_face(K, self._foundation(jnp.sum(self.spring)), 0)
+        if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
-            guarded = _add_face(guarded, self._regularisation(scale).astype(jnp.float32), 0)
+            guarded = _add_face(guarded, self._foundation(1e-3 * scale * self.positions[0, 0].size).astype(jnp.float32), 0)
         free = self.free
         if not free.all():
             K = held(K, jnp.asarray(free))
         return with_unit_diagonal(assemble_stencil(K), scale), guarded, scale
 
-    def _regularisation(self, scale: Array) -> Array:
+    def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 ny nx"]:
+        """Spread an in-plane stiffness [N/mm] evenly over the faces at the window, lumped at nodes."""
         ny, nx = (n - 1 for n in self.positions.shape[2:])
-        mass = np.array([[4, 2, 2, 1], [2, 4, 1, 2], [2, 1, 4, 2], [1, 2, 2, 4]]) / 36.0
-        lateral = np.diag([1.0, 1.0, 0.0])
-        weak = 1e-3 * scale * mass[:, :, None, None, None, None] * lateral[:, :, None, None]
-        return jnp.broadcast_to(weak, (4, 4, 3, 3, ny, nx))
+        lumped = np.eye(4)[:, :, None, None] * np.diag([1.0, 1.0, 0.0])
+        each = stiffness / (4.0 * nx * ny) * lumped[..., None, None]
+        return jnp.broadcast_to(each, (4, 4, 3, 3, ny, nx))
 
     def advance(self, u: Nodal, fraction: Array, state: State, held: Array) -> State:
         """Build the state at the end of an increment, friction history included."""

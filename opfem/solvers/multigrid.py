@@ -27,7 +27,7 @@ class Level(NamedTuple):
     """One grid: its operator, column inverses, largest eigenvalue and free unknowns."""
 
     stencil: Stencil
-    columns: Float[Array, "m m ny+1 nx+1"]
+    columns: Float[Array, "m m my mx"]
     largest: Float[Array, ""]
     free: Nodal | None
 
@@ -60,7 +60,8 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
             return Multigrid(tuple(levels), _dense_inverse(S), mask)
         columns = _invert_columns(column_blocks(S))
         levels.append(Level(S, columns, _largest_eigenvalue(S, columns), mask))
-        K = _coarsen(_coarsen(K, cell=-1, a_stride=1), cell=-2, a_stride=2)
+        for cell in _coarsened_axes(S.shape):
+            K = _coarsen(K, cell)
         free = None if free is None else _coarsen_mask(free)
 
 
@@ -75,7 +76,7 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     level = multigrid.levels[depth]
     x, r = _smooth(level, r)
     coarse = _v_cycle(multigrid, depth + 1, _free(multigrid, depth + 1, _restrict(r)))
-    correction = _prolong(coarse)[..., : r.shape[-2], : r.shape[-1]]
+    correction = _prolong(coarse, r.shape)
     correction = correction if level.free is None else correction * level.free
     r = r - apply_stencil(level.stencil, correction)
     return x + correction + _smooth(level, r)[0]
@@ -154,7 +155,12 @@ def _dense_inverse(S: Stencil) -> Array:
     return jnp.linalg.inv(dense)
 
 
-def _coarsen(K: ElementMatrices, cell: int, a_stride: int) -> ElementMatrices:
+def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Name the lateral axes long enough to coarsen; two elements are the fewest."""
+    return tuple(axis for axis in (-1, -2) if shape[axis] > 3)
+
+
+def _coarsen(K: ElementMatrices, cell: int) -> ElementMatrices:
     """Join pairs of elements along one axis (Galerkin product with linear interpolation)."""
     nz, ny, nx = K.shape[0], K.shape[-2], K.shape[-1]
     if K.shape[cell] % 2:
@@ -185,28 +191,29 @@ def _coarsen(K: ElementMatrices, cell: int, a_stride: int) -> ElementMatrices:
 
 
 def _coarsen_mask(free: np.ndarray) -> np.ndarray:
-    for axis in (-1, -2):
+    for axis in _coarsened_axes(free.shape):
         if free.shape[axis] % 2 == 0:  # odd count of elements: the ghost node is free
             widths = [(0, 0)] * free.ndim
             widths[axis] = (0, 1)
             free = np.pad(free, widths, constant_values=1)
-    return free[..., ::2, ::2]
+        free = free[..., ::2] if axis == -1 else free[..., ::2, :]
+    return free
 
 
-def _prolong(v: Nodal) -> Nodal:
-    for axis in (-1, -2):
+def _prolong(v: Nodal, shape: tuple[int, ...]) -> Nodal:
+    for axis in _coarsened_axes(shape):
         low = jax.lax.slice_in_dim(v, 0, v.shape[axis] - 1, axis=v.ndim + axis)
         high = jax.lax.slice_in_dim(v, 1, None, axis=v.ndim + axis)
         last = jax.lax.slice_in_dim(v, v.shape[axis] - 1, None, axis=v.ndim + axis)
         pairs = jnp.stack([low, 0.5 * (low + high)], axis=v.ndim + axis + 1)
-        shape = list(v.shape)
-        shape[axis] = 2 * (v.shape[axis] - 1)
-        v = jnp.concatenate([pairs.reshape(shape), last], axis=axis)
-    return v
+        doubled = list(v.shape)
+        doubled[axis] = 2 * (v.shape[axis] - 1)
+        v = jnp.concatenate([pairs.reshape(doubled), last], axis=axis)
+    return v[..., : shape[-2], : shape[-1]]
 
 
 def _restrict(r: Nodal) -> Nodal:
-    for axis in (-1, -2):
+    for axis in _coarsened_axes(r.shape):
         at = r.ndim + axis
         if r.shape[axis] % 2 == 0:
             widths = [(0, 0)] * r.ndim

@@ -41,10 +41,10 @@ class FaceResult(eqx.Module):
         status: 0 open, 1 stick, 2 slip.
     """
 
-    pressure: Float[Array, "ny+1 nx+1"]
-    traction: Float[Array, "3 ny+1 nx+1"]
-    slip: Float[Array, "2 ny+1 nx+1"]
-    status: Int[Array, "ny+1 nx+1"]
+    pressure: Float[Array, "my mx"]
+    traction: Float[Array, "3 my mx"]
+    slip: Float[Array, "2 my mx"]
+    status: Int[Array, "my mx"]
 
 
 class LastConverged(eqx.Module):
@@ -56,7 +56,7 @@ class LastConverged(eqx.Module):
         state: The same with its friction history, for `solve(..., start=)`.
     """
 
-    displacement: Float[Array, "3 nz+1 ny+1 nx+1"]
+    displacement: Float[Array, "3 mz my mx"]
     load_fraction: Float[Array, ""]
     state: State
 
@@ -79,8 +79,8 @@ class Solution(eqx.Module):
         load: Its load.
     """
 
-    displacement: Float[Array, "3 nz+1 ny+1 nx+1"]
-    positions: Float[Array, "3 nz+1 ny+1 nx+1"]
+    displacement: Float[Array, "3 mz my mx"]
+    positions: Float[Array, "3 mz my mx"]
     sample: FaceResult
     window: FaceResult
     thickness: ThicknessMap
@@ -92,22 +92,22 @@ class Solution(eqx.Module):
     load: Load
 
     @property
-    def pressure(self) -> Float[Array, "ny+1 nx+1"]:
+    def pressure(self) -> Float[Array, "my mx"]:
         """Contact pressure on the sample [MPa], on the current area."""
         return self.sample.pressure
 
     @property
-    def traction(self) -> Float[Array, "3 ny+1 nx+1"]:
+    def traction(self) -> Float[Array, "3 my mx"]:
         """Force on the layer at the interface per reference area [MPa]."""
         return self.sample.traction
 
     @property
-    def slip(self) -> Float[Array, "2 ny+1 nx+1"]:
+    def slip(self) -> Float[Array, "2 my mx"]:
         """Slip of the interface along the sample [mm]."""
         return self.sample.slip
 
     @property
-    def contact_status(self) -> Int[Array, "ny+1 nx+1"]:
+    def contact_status(self) -> Int[Array, "my mx"]:
         """Status of the interface: 0 open, 1 stick, 2 slip."""
         return self.sample.status
 

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from ..mechanics.hex8 import pad_axis
 
-Stencil = Float[Array, "3 9 3 3 nz+1 ny+1 nx+1"]
+Stencil = Float[Array, "3 9 3 3 mz my mx"]
 ElementMatrices = Float[Array, "nz 8 8 3 3 ny nx"]
-Nodal = Float[Array, "3 nz+1 ny+1 nx+1"]
+Nodal = Float[Array, "3 mz my mx"]
 
 _LATERAL = tuple(itertools.product(range(3), repeat=2))
 
@@ -86,7 +86,7 @@ def held(K: ElementMatrices, free: Nodal) -> ElementMatrices:
     return K * mask[:, :, None, :, None] * mask[:, None, :, None, :]
 
 
-def column_blocks(S: Stencil) -> Float[Array, "m m ny+1 nx+1"]:
+def column_blocks(S: Stencil) -> Float[Array, "m m my mx"]:
     """Collect each column's own matrix, m = 3 (nz+1) unknowns ordered (z, component)."""
     nodes = S.shape[4]
     blocks = 0.0

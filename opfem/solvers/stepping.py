@@ -16,6 +16,8 @@ from .solution import RESULTS
 
 # Friction takes over from the hold when it can carry the hold's force with this much to spare.
 _RELEASE_MARGIN = 0.5
+# Without the hold, an increment is cut down to this share of its full size before the hold returns.
+_LEAST_RELEASED = 0.2
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4
 
@@ -75,16 +77,16 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     left = 1.0 - s.state.fraction
     increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
     fraction = s.state.fraction + increment
-    held = s.state.held & ~(s.can_release & ~s.release_failed)
+    held = (s.state.held & ~(s.can_release & ~s.release_failed)) | s.release_failed
     span = s.state.fraction - s.before.fraction
     ahead = jnp.where(span > 0, increment / jnp.where(span > 0, span, 1.0), 0.0)
     guess = s.state.u + ahead * (s.state.u - s.before.u)
     result = solve_increment(problem, s.state, guess, fraction, held, settings)
     ok = result.converged
     can_release, slides = _hold_balance(problem, s.state, result.state)
-    # Without the hold and without convergence: take the hold back before cutting the increment.
-    lost_hold = ~ok & ~held & s.state.held
-    cut = jnp.where(lost_hold, s.increment, 0.5 * increment)
+    # Without the hold and without convergence: cut the increment a few times, then take the hold back.
+    lost_hold = ~ok & ~held & (increment < _LEAST_RELEASED / settings.increments)
+    cut = jnp.where(lost_hold, increment, 0.5 * increment)
     grown = jnp.minimum(1.5 * s.increment, 1.0 / settings.increments)
     grown = jnp.where(result.steps <= settings.max_steps // 2, grown, s.increment)
     chosen = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (result.state, s.state), (s.state, s.before))

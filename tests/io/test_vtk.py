@@ -5,9 +5,9 @@ import os
 import numpy as np
 import pytest
 import pyvista
-import tolerances as tol
 
 import opfem as op
+from tests import tolerances as tol
 
 
 @pytest.fixture(scope="module")

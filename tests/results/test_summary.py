@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tolerances as tol
 
 import opfem as op
 from opfem.results.fields import node_areas
+from tests import tolerances as tol
 
 COUNTS = ("_count", "_fraction", "_ratio", "_relative", "_percent", "_N", "_kPa", "_um")
 

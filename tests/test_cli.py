@@ -1,0 +1,276 @@
+"""`opfem palpate`: what it writes, what it refuses, and how it ends when something goes wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import equinox as eqx
+import numpy as np
+import pytest
+import pyvista
+import xarray as xr
+from PIL import Image
+
+import opfem as op
+from opfem import cli
+
+SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
+
+
+def opfem(*arguments) -> int:
+    """Run the command line and return its exit status."""
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    return end.value.code
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    x, y = np.meshgrid(np.linspace(0.0, 2.0, 21), np.linspace(0.0, 2.0, 17))
+    thickness = 0.5 * (1 - 0.07 - 0.06 * np.exp(-((x - 1.2) ** 2 + (y - 0.8) ** 2) / 0.3))
+    thickness[3, 4] = np.nan
+    np.save(tmp_path / "map.npy", thickness)
+    return tmp_path / "map.npy"
+
+
+@pytest.fixture
+def solved(monkeypatch, solution):
+    """The solve answers at once, with a solution of the same map."""
+    calls = []
+
+    def answer(palpation, load, solver):
+        calls.append((palpation, load, solver))
+        return solution
+
+    monkeypatch.setattr(cli, "solve", answer)
+    return calls
+
+
+def test_palpate_from_map_to_files(tmp_path, map_file, capsys):
+    out = tmp_path / "new" / "stress"
+    assert opfem("palpate", map_file, *SMALL, "--out", out) == 0
+    assert sorted(os.listdir(out)) == sorted(cli.FILES)
+
+    dataset = op.read_netcdf(out / "result.nc")
+    assert dataset.attrs["status"] in ("successful", "slides_off")
+    assert dataset.pressure.shape == (7, 7)
+    assert int(dataset.missing.sum()) == 1
+    steps = [step["step"] for step in json.loads(dataset.attrs["thickness_steps"])]
+    assert steps == ["read", "filled", "smoothed"]
+
+    numbers = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert numbers["pressure_max_kPa"] == pytest.approx(1e3 * float(dataset.pressure.max()))
+    assert numbers["settings"]["assumed"] == ["c10", "c01", "bulk"]
+    assert numbers["settings"]["smooth"] == 0.2
+    assert pyvista.read(out / "result.vtu").n_cells == 72
+    for picture in ("pressure.png", "report.png"):
+        with Image.open(out / picture) as image:
+            assert min(image.size) > 500
+
+    said = capsys.readouterr().out
+    assert "Assumed: c10, c01, bulk" in said
+    assert "1 missing and filled" in said
+    assert f"{numbers['pressure_mean_kPa']:.3g}" in said
+    assert "kPa" in said
+
+
+def test_defaults_are_the_published_case(tmp_path, map_file, solved):
+    assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.5, "--out", tmp_path / "o") == 0
+    palpation, load, solver = solved[0]
+    expected = op.Palpation(
+        op.Layer(0.5, op.MooneyRivlin(c10=0.00223, c01=0.000703, bulk=0.11732)),
+        extent=(2.0, 2.0),
+        elements=(40, 40, 4),
+        window=op.Contact(op.HardOverclosure(), 0.15),
+        sample=op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.05),
+    )
+    assert eqx.tree_equal(palpation, expected)
+    assert eqx.tree_equal(solver, op.Newton())
+    # Half an element.
+    assert float(load.thickness.steps[-1].numbers["fwhm"]) == pytest.approx(0.025)
+    assert not load.correct_approach
+
+
+def test_options_arrive(tmp_path, map_file, solved):
+    given = """
+        --c10 0.003 --c01 0.0005 --bulk 0.2 --window-friction 0.3 --sample-friction 0.1 --p0 1 --c0 0.02 --sides roller
+        --element full --elements 8 6 2 --increments 5 --smooth 0 --correct-approach --layer-extent 1.5 1.8
+    """
+    assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.4, *given.split(), "--out", tmp_path / "o") == 0
+    palpation, load, solver = solved[0]
+    expected = op.Palpation(
+        op.Layer(0.4, op.MooneyRivlin(c10=0.003, c01=0.0005, bulk=0.2)),
+        extent=(1.5, 1.8),
+        elements=(8, 6, 2),
+        window=op.Contact(op.HardOverclosure(), 0.3),
+        sample=op.Contact(op.ExponentialOverclosure(1.0, 0.02), 0.1),
+        sides="roller",
+        element="full",
+    )
+    assert eqx.tree_equal(palpation, expected)
+    assert solver.increments == 5
+    assert load.correct_approach
+    assert [step.name for step in load.thickness.steps] == ["read", "filled"]
+
+
+def test_unloaded_map(tmp_path, map_file, solved):
+    np.save(tmp_path / "l0.npy", np.full((17, 21), 500.0))
+    np.save(map_file, 1e3 * np.load(map_file))
+    arguments = ("--extent", 2, 2, "--unit", "um", "--l0", tmp_path / "l0.npy", "--out", tmp_path / "o")
+    assert opfem("palpate", map_file, *arguments) == 0
+    thickness = solved[0][0].layer.thickness
+    np.testing.assert_allclose(thickness.values, 0.5)
+    assert [step.name for step in thickness.steps] == ["read", "smoothed"]
+
+
+def test_example_is_written_and_is_its_own_input(tmp_path, monkeypatch):
+    def stop(palpation, load, solver):
+        raise RuntimeError("far enough")
+
+    monkeypatch.setattr(cli, "solve", stop)
+    assert opfem("palpate", "example", "--out", tmp_path / "o") == 1
+    assert os.listdir(tmp_path / "o") == ["example_map.npz"]
+    assert eqx.tree_equal(op.read_thickness(tmp_path / "o" / "example_map.npz"), op.measurement.example_map())
+
+
+class TestRefusals:
+    def refused(self, capsys, *arguments, status=1) -> str:
+        assert opfem("palpate", *arguments) == status
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err + said.out
+        return said.err
+
+    def test_finished_result(self, tmp_path, map_file, solved, capsys):
+        out = tmp_path / "o"
+        assert opfem("palpate", map_file, *SMALL, "--out", out) == 0
+        before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+        capsys.readouterr()
+        assert "--force" in self.refused(capsys, map_file, *SMALL, "--out", out)
+        assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
+        assert opfem("palpate", map_file, *SMALL, "--out", out, "--force") == 0
+        assert all(path.stat().st_mtime_ns > before[path.name] for path in out.iterdir())
+
+    def test_folder_that_cannot_be_written(self, tmp_path, map_file, solved, capsys):
+        (tmp_path / "file").write_text("")
+        for out in (tmp_path / "file", tmp_path / "file" / "o"):
+            assert "Cannot write results" in self.refused(capsys, map_file, *SMALL, "--out", out)
+        assert solved == []
+
+    def test_missing_file(self, tmp_path, solved, capsys):
+        said = self.refused(capsys, tmp_path / "none.mat", *SMALL, "--out", tmp_path / "o")
+        assert "none.mat: no such file" in said
+        assert not (tmp_path / "o").exists()
+
+    def test_wrong_unit(self, tmp_path, map_file, solved, capsys):
+        said = self.refused(capsys, map_file, *SMALL, "--unit", "um", "--out", tmp_path / "o")
+        assert "unit" in said
+        assert "--unit" in self.refused(capsys, map_file, *SMALL, "--unit", "inch", "--out", tmp_path / "o", status=2)
+
+    @pytest.mark.parametrize(
+        ("arguments", "reason"),
+        [
+            (("--extent", 2, 2), "--l0 is needed"),
+            (("--l0", 0.5), "needs either extent"),
+            (("--extent", 2, 2, "--l0", "none.npy"), "none.npy: no such file"),
+            (("--extent", 2, 2, "--l0", 0.5, "--c10", 0.003), "--bulk"),
+            (("--extent", 2, 2, "--l0", -0.5), "must be positive"),
+            (("--extent", 2, 2, "--l0", 0.5, "--sample-friction", -1), "Contact.friction"),
+            (("--extent", 2, 2, "--l0", 0.5, "--elements", 0, 6, 2), "elements"),
+        ],
+    )
+    def test_options(self, tmp_path, map_file, solved, capsys, arguments, reason):
+        assert reason in self.refused(capsys, map_file, *arguments, "--out", tmp_path / "o")
+        assert solved == []
+
+    def test_example_with_a_grid(self, tmp_path, solved, capsys):
+        assert "--extent" in self.refused(capsys, "example", "--extent", 2, 2, "--out", tmp_path / "o")
+
+    def test_map_away_from_the_origin(self, tmp_path, loaded, solved, capsys):
+        op.write_thickness(loaded.cropped(x=(0.5, 1.5)), tmp_path / "cropped.npz")
+        arguments = (tmp_path / "cropped.npz", "--l0", 0.5, "--out", tmp_path / "o")
+        assert "--layer-extent" in self.refused(capsys, *arguments)
+
+    def test_traceback_on_demand(self, tmp_path, map_file, monkeypatch, capsys):
+        def fail(*_):
+            raise RuntimeError("inner")
+
+        monkeypatch.setattr(cli, "solve", fail)
+        said = self.refused(capsys, map_file, *SMALL, "--out", tmp_path / "o")
+        assert "Unexpected RuntimeError: inner" in said
+        with pytest.raises(RuntimeError, match="inner"):
+            cli.main([str(part) for part in ("palpate", map_file, *SMALL, "--out", tmp_path / "o", "--debug")])
+
+
+class TestFailures:
+    def test_no_convergence_is_recorded(self, tmp_path, map_file, failed_solution, monkeypatch, capsys):
+        def fail(*_):
+            raise op.ConvergenceError("The solve stopped at 40.0% of the load.", failed_solution)
+
+        out = tmp_path / "o"
+        out.mkdir()
+        (out / "result.nc").write_text("of an earlier run")
+        monkeypatch.setattr(cli, "solve", fail)
+        assert opfem("palpate", map_file, *SMALL, "--out", out, "--force") == 1
+        assert "stopped at 40.0% of the load" in capsys.readouterr().err
+        assert os.listdir(out) == ["summary.json"]
+        numbers = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        assert numbers["status"] == "increment_too_small"
+        assert numbers["load_reached_percent"] == pytest.approx(40)
+        assert numbers["pressure_max_kPa"] is None
+
+    def test_interrupted_solve_keeps_the_earlier_result(self, tmp_path, map_file, monkeypatch, capsys):
+        def interrupt(*_):
+            raise KeyboardInterrupt
+
+        out = tmp_path / "o"
+        out.mkdir()
+        (out / "result.nc").write_text("of an earlier run")
+        monkeypatch.setattr(cli, "solve", interrupt)
+        assert opfem("palpate", map_file, *SMALL, "--out", out, "--force") == 130
+        assert "Interrupted" in capsys.readouterr().err
+        assert os.listdir(out) == ["result.nc"]
+
+    def test_interrupted_writing_leaves_only_whole_files(self, tmp_path, map_file, solved, monkeypatch):
+        def half(self, target, **_):
+            target.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(xr.Dataset, "to_netcdf", half)
+        out = tmp_path / "o"
+        assert opfem("palpate", map_file, *SMALL, "--out", out) == 130
+        assert sorted(os.listdir(out)) == sorted(set(cli.FILES) - {"result.nc"})
+        assert pyvista.read(out / "result.vtu").n_cells == 72
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [2, 5])
+def test_ctrl_c_in_a_fresh_process(tmp_path, seconds):
+    """The interpreter ends in order although a computation is in flight."""
+    out = tmp_path / "o"
+    code = "from opfem.cli import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "palpate", "example", "--out", out, "--elements", "20", "20", "4"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    while process.poll() is None and not (out / "example_map.npz").exists():
+        time.sleep(0.1)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Interrupted" in said
+    assert os.listdir(out) == ["example_map.npz"]
+
+
+def test_help_in_a_fresh_process():
+    code = "from opfem.cli import main; main(['palpate', '--help'])"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for option in ("--out", "--l0", "--extent", "--elements", "--bulk", "--window-friction", "--force"):
+        assert option in answer.stdout
+    code = "import opfem.cli, jax, sys; print(jax.config.jax_enable_x64, 'matplotlib' in sys.modules)"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "False False"
