@@ -28,4 +28,10 @@ from .model import (
     Traction as Traction,
 )
 from .results import summary as summary, to_xarray as to_xarray
-from .solvers import RESULTS as RESULTS, ConvergenceError as ConvergenceError, Newton as Newton, Solution as Solution, solve as solve
+from .solvers import (
+    RESULTS as RESULTS,
+    ConvergenceError as ConvergenceError,
+    Newton as Newton,
+    Solution as Solution,
+    solve as solve,
+)

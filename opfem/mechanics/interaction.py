@@ -194,7 +194,9 @@ class ContactFace(eqx.Module):
         """Start from the pressure of the last increment, as if every point had stuck."""
         return ContactIterate(history.pressure, jnp.zeros_like(history.elastic))
 
-    def tangent_law(self, fraction: Array, x: Face, history: SlipHistory, iterate: ContactIterate, curvature: Array) -> TangentLaw:
+    def tangent_law(
+        self, fraction: Array, x: Face, history: SlipHistory, iterate: ContactIterate, curvature: Array
+    ) -> TangentLaw:
         """Linearise contact for the state x.
 
         A point without pressure that has come to touch takes what the law gives there, at most
@@ -213,7 +215,9 @@ class ContactFace(eqx.Module):
         closed = (pressure - self.stiffness * (clearance - at) >= 0) & (slope < 0)
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
 
-    def follow(self, fraction: Array, x: Face, change: Face, history: SlipHistory, law: TangentLaw, length: Array) -> ContactIterate:
+    def follow(
+        self, fraction: Array, x: Face, change: Face, history: SlipHistory, law: TangentLaw, length: Array
+    ) -> ContactIterate:
         """Compute what the next iteration remembers after a step of `length` along `change`.
 
         The pressure follows the clearance's linear change.
@@ -266,7 +270,9 @@ class ContactFace(eqx.Module):
         y = jnp.concatenate(surface_tangents(x, self.rule))
         return to_nodes(jnp.moveaxis(self._density(fraction, y, history, law), 1, 0), self.rule)
 
-    def stiffness_matrices(self, fraction: Array, x: Face, history: SlipHistory, law: TangentLaw | None = None) -> tuple[Array, Array]:
+    def stiffness_matrices(
+        self, fraction: Array, x: Face, history: SlipHistory, law: TangentLaw | None = None
+    ) -> tuple[Array, Array]:
         """Compute -d(force)/dx of every face `(4 a, 4 b, 3, 3, ny, nx)` [N/mm].
 
         Returns:
@@ -277,7 +283,9 @@ class ContactFace(eqx.Module):
         y = jnp.concatenate(surface_tangents(x, self.rule))
         basis = jnp.broadcast_to(jnp.eye(9, dtype=y.dtype)[:, :, None, None, None], (9, *y.shape))
         at_law = None if law is None else law.at_its_pressure()
-        slopes = jax.vmap(lambda e: jax.jvp(lambda v: self._density(fraction, v, history, at_law), (y,), (e,))[1])(basis)
+        slopes = jax.vmap(lambda e: jax.jvp(lambda v: self._density(fraction, v, history, at_law), (y,), (e,))[1])(
+            basis
+        )
         by_point = slopes.reshape(3, 3, *slopes.shape[1:])  # (N | dN_ξ | dN_η), j, i, points, ny, nx
         by_point = jnp.transpose(by_point, (3, 0, 2, 1, 4, 5))
         weights = q.N * q.weights[:, None]

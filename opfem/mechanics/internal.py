@@ -55,13 +55,14 @@ class LayerBody(eqx.Module):
 
         def one_layer(inputs):
             nodal, slope_x, slope_y = inputs
-            geometry = ElementGeometry(
-                self.geometry.spacing, self.geometry.depth, slope_x[:, None], slope_y[:, None]
-            )
+            geometry = ElementGeometry(self.geometry.spacing, self.geometry.depth, slope_x[:, None], slope_y[:, None])
             return self._layer_stiffness(geometry, nodal[:, :, None])
 
         nodal = gather(u)
-        per_layer = (jnp.moveaxis(nodal, 2, 0), *(jnp.moveaxis(s, 1, 0) for s in (self.geometry.slope_x, self.geometry.slope_y)))
+        per_layer = (
+            jnp.moveaxis(nodal, 2, 0),
+            *(jnp.moveaxis(s, 1, 0) for s in (self.geometry.slope_x, self.geometry.slope_y)),
+        )
         return jax.lax.map(one_layer, per_layer)
 
     def _layer_stiffness(self, geometry: ElementGeometry, nodal: Array) -> Float[Array, "8 8 3 3 ny nx"]:

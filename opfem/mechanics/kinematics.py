@@ -68,7 +68,9 @@ def element_geometry(mesh: LayerMesh) -> ElementGeometry:
     )
 
 
-def displacement_gradient(geometry: ElementGeometry, nodal: Float[Array, "8 3 nz ny nx"]) -> Float[Array, "3 3 8 nz ny nx"]:
+def displacement_gradient(
+    geometry: ElementGeometry, nodal: Float[Array, "8 3 nz ny nx"]
+) -> Float[Array, "3 3 8 nz ny nx"]:
     """Compute H[i, J] = du_i/dX_J at the Gauss points from element nodal displacements."""
     return geometry.from_reference(contract(GRADIENTS, nodal))
 

@@ -215,7 +215,11 @@ def outer(A: Tensor, B: Tensor) -> Float[Array, "3 3 3 3 *points"]:
 def cofactor(A: Tensor) -> Tensor:
     """Compute the cofactor matrix, det(A) A^(-T)."""
     rows = [
-        [A[(i + 1) % 3, (j + 1) % 3] * A[(i + 2) % 3, (j + 2) % 3] - A[(i + 1) % 3, (j + 2) % 3] * A[(i + 2) % 3, (j + 1) % 3] for j in range(3)]
+        [
+            A[(i + 1) % 3, (j + 1) % 3] * A[(i + 2) % 3, (j + 2) % 3]
+            - A[(i + 1) % 3, (j + 2) % 3] * A[(i + 2) % 3, (j + 1) % 3]
+            for j in range(3)
+        ]
         for i in range(3)
     ]
     return jnp.stack([jnp.stack(row) for row in rows])

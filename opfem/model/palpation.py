@@ -66,7 +66,9 @@ class Palpation(eqx.Module):
             raise ValueError(f"Palpation.elements must be three whole numbers (nx, ny, nz) ≥ 1, got {elements!r}.")
         for name, side in (("window", window), ("sample", sample)):
             if not isinstance(side, (Bonded, Roller, Contact)):
-                raise ValueError(f"Palpation.{name} must be Bonded(), Roller() or Contact(law, friction), got {side!r}.")
+                raise ValueError(
+                    f"Palpation.{name} must be Bonded(), Roller() or Contact(law, friction), got {side!r}."
+                )
         if element not in ELEMENTS:
             raise ValueError(f"Palpation.element must be one of {ELEMENTS}, got {element!r}.")
         if hold is not None:

@@ -8,11 +8,25 @@ from .._checks import concrete
 from ..mechanics.face import FaceRule, area_vector, size, surface_tangents, tributary_area
 from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
 from ..mechanics.internal import layer_body
-from ..model import Bonded, Contact, Displacement, HeightField, Imprint, LayerMesh, Load, Palpation, Roller, Traction, height_field
+from ..model import (
+    Bonded,
+    Contact,
+    Displacement,
+    HeightField,
+    Imprint,
+    LayerMesh,
+    Load,
+    Palpation,
+    Roller,
+    Traction,
+    height_field,
+)
 from .equilibrium import Problem, Supports
 
 
-def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceRule, approach: Array | None = None) -> Problem:
+def discretise(
+    palpation: Palpation, load: Load, start: Load | None, rule: FaceRule, approach: Array | None = None
+) -> Problem:
     """Build the discrete problem.
 
     Args:
@@ -32,7 +46,9 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     stiffness = (material.bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
 
     def face(contact: Contact, surface: RigidSurface, above: bool, offset=0.0, imposed=None, rule=rule) -> ContactFace:
-        return ContactFace(contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule)
+        return ContactFace(
+            contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
+        )
 
     plane = RigidSurface(None, None)
     window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
@@ -130,5 +146,7 @@ def _displacement(load: Displacement | None, mesh: LayerMesh) -> Array:
 
 def _on_nodes(field: str, unit: str, values: Array, shape: tuple[int, int]) -> Array:
     if values.ndim and values.shape != shape:
-        raise ValueError(f"{field} [{unit}] must be a number or interface nodes (ny+1, nx+1) = {shape}, got {values.shape}.")
+        raise ValueError(
+            f"{field} [{unit}] must be a number or interface nodes (ny+1, nx+1) = {shape}, got {values.shape}."
+        )
     return jnp.broadcast_to(values, shape)

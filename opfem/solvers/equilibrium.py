@@ -18,6 +18,7 @@ from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
 from .stencil import Nodal, Stencil, assemble_stencil, held, with_unit_diagonal
 
+
 class Supports(NamedTuple):
     """Which displacements are prescribed: static, so that it shapes the compiled solve."""
 
@@ -129,18 +130,25 @@ class Problem(eqx.Module):
             window = self.window.force(fraction, self.positions[:, 0] + u[:, 0], state.window, laws.window)
         return forces._replace(sample=sample, window=window)
 
-    def tangent_laws(self, u: Nodal, fraction: Array, state: State, iterates: ContactIterates, curvature: Array) -> TangentLaws:
+    def tangent_laws(
+        self, u: Nodal, fraction: Array, state: State, iterates: ContactIterates, curvature: Array
+    ) -> TangentLaws:
         """Linearise contact on both faces."""
         laws = [
-            None if face is None else face.tangent_law(fraction, self.positions[:, layer] + u[:, layer], history, iterate, curvature)
+            None
+            if face is None
+            else face.tangent_law(fraction, self.positions[:, layer] + u[:, layer], history, iterate, curvature)
             for face, history, iterate, layer in self._faces(state, iterates)
         ]
         return TangentLaws(*laws)
 
-    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: TangentLaws, length: Array) -> ContactIterates:
+    def follow(
+        self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: TangentLaws, length: Array
+    ) -> ContactIterates:
         """Compute what the next iteration remembers after a step of `length` along `change`."""
         iterates = [
-            None if face is None
+            None
+            if face is None
             else face.follow(fraction, self.positions[:, layer] + u[:, layer], change[:, layer], history, law, length)
             for face, history, law, layer in self._faces(state, laws)
         ]
@@ -149,7 +157,10 @@ class Problem(eqx.Module):
     def initial_iterates(self, state: State) -> ContactIterates:
         """Start the iteration from the contact of a converged state."""
         return ContactIterates(
-            *(None if face is None else face.initial_iterate(history) for face, history, _, _ in self._faces(state, (None, None)))
+            *(
+                None if face is None else face.initial_iterate(history)
+                for face, history, _, _ in self._faces(state, (None, None))
+            )
         )
 
     def _faces(self, state: State, each: tuple):
@@ -158,8 +169,16 @@ class Problem(eqx.Module):
     def reactions(self, forces: Forces) -> Forces:
         """Add the reactions of prescribed displacements to the forces of window and sample."""
         unbalanced = self._unbalanced(forces)
-        prescribed = {"contact": (0, 0, 0), "traction": (0, 0, 0), "roller": (0, 0, 1), "uz": (0, 0, 1), "bonded": (1, 1, 1)}
-        top, bottom = (np.array(prescribed[kind])[:, None, None] for kind in (self.supports.interface, self.supports.window))
+        prescribed = {
+            "contact": (0, 0, 0),
+            "traction": (0, 0, 0),
+            "roller": (0, 0, 1),
+            "uz": (0, 0, 1),
+            "bonded": (1, 1, 1),
+        }
+        top, bottom = (
+            np.array(prescribed[kind])[:, None, None] for kind in (self.supports.interface, self.supports.window)
+        )
         return forces._replace(
             sample=forces.sample + top * unbalanced[:, -1], window=forces.window + bottom * unbalanced[:, 0]
         )
@@ -245,7 +264,9 @@ class Problem(eqx.Module):
             K = _add_face(K, self._foundation(jnp.sum(self.spring)), 0)
         if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
-            guarded = _add_face(guarded, self._foundation(1e-3 * scale * self.positions[0, 0].size).astype(jnp.float32), 0)
+            guarded = _add_face(
+                guarded, self._foundation(1e-3 * scale * self.positions[0, 0].size).astype(jnp.float32), 0
+            )
         free = self.free
         if not free.all():
             K = held(K, jnp.asarray(free))

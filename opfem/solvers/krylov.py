@@ -34,9 +34,9 @@ def fgmres(
     operator: Callable[[Array], Array],
     preconditioner: Callable[[Array], Array],
     b: Array,
-    rtol: Array,
+    rtol: float | int | Array,
     basis: int,
-    max_iterations: int,
+    max_iterations: float | int | Array,
 ) -> KrylovResult:
     """Solve operator(x) = b to a residual of rtol × |b|.
 
@@ -66,7 +66,9 @@ def fgmres(
             j=jnp.zeros((), int),
         )
         end = jax.lax.while_loop(
-            lambda s: (s.j < basis) & (jnp.abs(s.g[s.j]) > target), lambda s: _extend(s, operator, preconditioner, shape), start
+            lambda s: (s.j < basis) & (jnp.abs(s.g[s.j]) > target),
+            lambda s: _extend(s, operator, preconditioner, shape),
+            start,
         )
         # Columns not reached keep the identity and a zero right-hand side.
         right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
@@ -79,7 +81,9 @@ def fgmres(
         _, _, iterations, size = carry
         return (size > 2.0 * target) & (iterations < max_iterations)
 
-    x, _, iterations, size = jax.lax.while_loop(unfinished, restart, (jnp.zeros_like(b), b, jnp.zeros((), int), _norm(b) + target))
+    x, _, iterations, size = jax.lax.while_loop(
+        unfinished, restart, (jnp.zeros_like(b), b, jnp.zeros((), int), _norm(b) + target)
+    )
     norm = _norm(b)
     return KrylovResult(x, size / jnp.where(norm > 0, norm, 1.0), iterations)
 

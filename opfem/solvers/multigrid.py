@@ -13,7 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .stencil import ElementMatrices, Nodal, Stencil, apply_stencil, assemble_stencil, column_blocks, held, with_unit_diagonal
+from .stencil import (
+    ElementMatrices,
+    Nodal,
+    Stencil,
+    apply_stencil,
+    assemble_stencil,
+    column_blocks,
+    held,
+    with_unit_diagonal,
+)
 
 # Chebyshev smooths the part of the spectrum above the largest eigenvalue over this number.
 _SMOOTHED_RANGE = 8.0
@@ -160,9 +169,9 @@ def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(axis for axis in (-1, -2) if shape[axis] > 3)
 
 
-def _coarsen(K: ElementMatrices, cell: int) -> ElementMatrices:
+def _coarsen(K: ElementMatrices, cell: int) -> Array:
     """Join pairs of elements along one axis (Galerkin product with linear interpolation)."""
-    nz, ny, nx = K.shape[0], K.shape[-2], K.shape[-1]
+    nz = K.shape[0]
     if K.shape[cell] % 2:
         widths = [(0, 0)] * K.ndim
         widths[cell] = (0, 1)
@@ -182,7 +191,12 @@ def _coarsen(K: ElementMatrices, cell: int) -> ElementMatrices:
 
     def high(p):
         near = 0.5 * p[0, 1] + 0.25 * p[0, 0]
-        return 0.25 * p[0, 0], near, 0.5 * p[1, 0] + 0.25 * p[0, 0], p[1, 1] + 0.5 * (p[0, 1] + p[1, 0]) + 0.25 * p[0, 0]
+        return (
+            0.25 * p[0, 0],
+            near,
+            0.5 * p[1, 0] + 0.25 * p[0, 0],
+            p[1, 1] + 0.5 * (p[0, 1] + p[1, 0]) + 0.25 * p[0, 0],
+        )
 
     c00, c01, c10, c11 = (e + o for e, o in zip(low(pairs(even)), high(pairs(odd)), strict=True))
     rows = [jnp.stack([c00, c01], axis=b_axis - 1), jnp.stack([c10, c11], axis=b_axis - 1)]
@@ -200,7 +214,7 @@ def _coarsen_mask(free: np.ndarray) -> np.ndarray:
     return free
 
 
-def _prolong(v: Nodal, shape: tuple[int, ...]) -> Nodal:
+def _prolong(v: Array, shape: tuple[int, ...]) -> Array:
     for axis in _coarsened_axes(shape):
         low = jax.lax.slice_in_dim(v, 0, v.shape[axis] - 1, axis=v.ndim + axis)
         high = jax.lax.slice_in_dim(v, 1, None, axis=v.ndim + axis)
@@ -212,7 +226,7 @@ def _prolong(v: Nodal, shape: tuple[int, ...]) -> Nodal:
     return v[..., : shape[-2], : shape[-1]]
 
 
-def _restrict(r: Nodal) -> Nodal:
+def _restrict(r: Array) -> Array:
     for axis in _coarsened_axes(r.shape):
         at = r.ndim + axis
         if r.shape[axis] % 2 == 0:

@@ -13,15 +13,17 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import check_positive
+from ..mechanics.face import FaceRule
 from .equilibrium import ContactIterates, Forces, Problem, State
 from .krylov import fgmres
 from .multigrid import apply_multigrid, build_multigrid
 from .stencil import Nodal, apply_stencil
 
-
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
 _SETTLED = 0.3
+# Directions GMRES keeps before it restarts.
+_KRYLOV_BASIS = 30
 # An increment is cut when this many of its linear systems could not be solved.
 _MOST_UNSOLVED = 3
 
@@ -50,19 +52,31 @@ class Newton(eqx.Module):
         ValueError: If a number is not positive.
     """
 
-    rtol: float = eqx.field(static=True, default=1e-7)
-    increments: int = eqx.field(static=True, default=8)
-    max_steps: int = eqx.field(static=True, default=20)
-    min_increment: float = eqx.field(static=True, default=1e-4)
+    rtol: float | int | Array = 1e-7
+    increments: float | int | Array = 8
+    max_steps: float | int | Array = 20
+    min_increment: float | int | Array = 1e-4
+    krylov_rtol: float | int | Array = 1e-2
+    krylov_steps: float | int | Array = 120
+    max_backtracks: float | int | Array = 6
+    step_limit: float | int | Array = 0.1
     max_increments: int = eqx.field(static=True, default=400)
-    krylov_rtol: float = eqx.field(static=True, default=1e-2)
-    krylov_steps: int = eqx.field(static=True, default=120)
-    max_backtracks: int = eqx.field(static=True, default=6)
-    step_limit: float = eqx.field(static=True, default=0.1)
-    face_rule: str = eqx.field(static=True, default="gauss2")
+    face_rule: FaceRule = eqx.field(static=True, default="gauss2")
+
+    def as_leaves(self) -> "Newton":
+        """Make every number an array, so that another value compiles nothing anew."""
+        return jax.tree.map(jnp.asarray, self)
 
     def __check_init__(self):
-        for name in ("rtol", "increments", "max_steps", "min_increment", "max_increments", "krylov_rtol", "krylov_steps"):
+        for name in (
+            "rtol",
+            "increments",
+            "max_steps",
+            "min_increment",
+            "max_increments",
+            "krylov_rtol",
+            "krylov_steps",
+        ):
             check_positive(f"Newton.{name}", "-", getattr(self, name))
         if self.face_rule not in ("gauss2", "gauss3", "nodes"):
             raise ValueError(f'Newton.face_rule must be "gauss2", "gauss3" or "nodes", got {self.face_rule!r}.')
@@ -90,7 +104,9 @@ class _Iterate(NamedTuple):
     unsolved: Array  # linear solves that ended at krylov_steps
 
 
-def solve_increment(problem: Problem, state: State, guess: Nodal, fraction: Array, held: Array, settings: Newton) -> IncrementResult:
+def solve_increment(
+    problem: Problem, state: State, guess: Nodal, fraction: Array, held: Array, settings: Newton
+) -> IncrementResult:
     """Find equilibrium at a load fraction, from a converged state and a first guess."""
 
     def evaluate(u):
@@ -114,8 +130,8 @@ def solve_increment(problem: Problem, state: State, guess: Nodal, fraction: Arra
             lambda v: problem.project(apply_stencil(S, problem.project(v, held)), held),
             lambda v: problem.project(apply_multigrid(multigrid, v), held),
             -r,
-            jnp.asarray(settings.krylov_rtol, it.u.dtype),
-            basis=min(30, settings.krylov_steps),
+            settings.krylov_rtol,
+            basis=_KRYLOV_BASIS,
             max_iterations=settings.krylov_steps,
         )
         direction = problem.project(_limited(problem, solution.x, settings.step_limit), held) * free
@@ -155,7 +171,7 @@ def solve_increment(problem: Problem, state: State, guess: Nodal, fraction: Arra
     )
 
 
-def _limited(problem: Problem, change: Nodal, step_limit: float) -> Nodal:
+def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:
     """Shorten the moves of single nodes that stand out of a step."""
     reach = jnp.sqrt(jnp.sum(change**2, axis=0))
     longest = step_limit * jnp.min(problem.body.geometry.spacing) + 4.0 * jnp.mean(reach)

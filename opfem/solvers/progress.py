@@ -11,9 +11,18 @@ class LoadProgress:
 
     def __init__(self, wanted: bool):
         console = Console(stderr=True)
-        columns = (TextColumn("load"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TextColumn("{task.description}"), TimeElapsedColumn())
+        columns = (
+            TextColumn("load"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+        )
         self._bar = Progress(
-            *columns, console=console, transient=True, disable=not (wanted and (console.is_terminal or console.is_jupyter))
+            *columns,
+            console=console,
+            transient=True,
+            disable=not (wanted and (console.is_terminal or console.is_jupyter)),
         )
         self._task = self._bar.add_task("compiling", total=1.0)
 
@@ -21,7 +30,9 @@ class LoadProgress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._bar.stop()
 
     def show(self, fraction: float, attempts: int, newton: int) -> None:

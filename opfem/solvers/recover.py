@@ -6,10 +6,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
-from ..mechanics.face import area_vector, gather_face, nodal_area_vector, quadrature, size, surface_tangents, to_nodes, tributary_area
+from ..mechanics.face import (
+    area_vector,
+    nodal_area_vector,
+    size,
+    surface_tangents,
+    to_nodes,
+    tributary_area,
+)
 from ..mechanics.interaction import ContactFace, SlipHistory
-from ..mechanics.kinematics import contract
-from ..model import Contact, Imprint, Load
+from ..model import Imprint, Load
 from .equilibrium import Problem, State
 from .solution import OPEN, SLIP, STICK, FaceResult
 
@@ -34,8 +40,12 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     forces = problem.reactions(problem.forces(u, state.fraction, before))
     hold = problem.hold_force(forces, state.held)
     stress = problem.body.cauchy(u)[2, 2]
-    sample, sample_stats = _face(problem, problem.sample, problem.supports.interface, before.sample, state.sample, forces.sample, state, -1)
-    window, window_stats = _face(problem, problem.window, problem.supports.window, before.window, state.window, forces.window, state, 0)
+    sample, sample_stats = _face(
+        problem, problem.sample, problem.supports.interface, before.sample, state.sample, forces.sample, state, -1
+    )
+    window, window_stats = _face(
+        problem, problem.window, problem.supports.window, before.window, state.window, forces.window, state, 0
+    )
     dissipated = [h.dissipated for h in (state.sample, state.window) if h is not None]
     stats = {
         "force_sample": jnp.sum(forces.sample, axis=(1, 2)),
@@ -53,7 +63,16 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     return Fields(sample, window, _thickness(problem, u, load), mean, stats)
 
 
-def _face(problem, face: ContactFace | None, support: str, before: SlipHistory | None, after: SlipHistory | None, force: Array, state: State, layer: int) -> tuple[FaceResult, dict[str, Array]]:
+def _face(
+    problem,
+    face: ContactFace | None,
+    support: str,
+    before: SlipHistory | None,
+    after: SlipHistory | None,
+    force: Array,
+    state: State,
+    layer: int,
+) -> tuple[FaceResult, dict[str, Array]]:
     X = problem.positions[:, layer]
     x = X + state.u[:, layer]
     area = nodal_area_vector(x)

@@ -46,8 +46,11 @@ def solve(
         ConvergenceError: If the solve fails and `throw` is True.
     """
     _require_float64(palpation)
+    solver = solver.as_leaves()
     load_start = None if start is None else start.load
-    problem, initial = _prepare(palpation, load, load_start, solver, None if start is None else start.last_converged.state)
+    problem, initial = _prepare(
+        palpation, load, load_start, solver, None if start is None else start.last_converged.state
+    )
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, initial)))
     run = _run_traced if traced else _run_with_progress
     stepping = run(problem, initial, solver, progress)
@@ -82,21 +85,30 @@ def _run_traced(problem: Problem, stepping: Stepping, solver: Newton, progress: 
     return jax.lax.while_loop(unfinished, lambda s: attempt(problem, s, solver), stepping)
 
 
-def _correct_approach(palpation, load, load_start, solver, problem, stepping, run, progress) -> tuple[Problem, Stepping]:
+def _correct_approach(
+    palpation, load, load_start, solver, problem, stepping, run, progress
+) -> tuple[Problem, Stepping]:
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
         approach = _approach(problem, stepping, load)
-        shifted = eqx.tree_at(lambda p: p.sample.offset, problem, palpation.sample.law.zero_pressure_clearance - approach)
+        shifted = eqx.tree_at(
+            lambda p: p.sample.offset, problem, palpation.sample.law.zero_pressure_clearance - approach
+        )
         # The surface is in place; what is left is one increment at the full load.
         again = begin(stepping.state, solver)
         before = eqx.tree_at(lambda s: s.fraction, stepping.state, jnp.zeros_like(stepping.state.fraction))
         again = again._replace(
-            state=eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment), before=before,
-            can_release=stepping.can_release, release_failed=stepping.release_failed,
+            state=eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment),
+            before=before,
+            can_release=stepping.can_release,
+            release_failed=stepping.release_failed,
         )
         again = again._replace(before=again.state)
         stepping_next = run(shifted, again, solver, progress)
-        totals = {name: getattr(stepping, name) + getattr(stepping_next, name) for name in ("attempts", "increments", "newton", "krylov")}
+        totals = {
+            name: getattr(stepping, name) + getattr(stepping_next, name)
+            for name in ("attempts", "increments", "newton", "krylov")
+        }
         problem, stepping = shifted, stepping_next._replace(**totals)
     return problem, stepping
 

@@ -61,8 +61,19 @@ def begin(state: State, settings: Newton) -> Stepping:
     zero, no = jnp.zeros((), int), jnp.asarray(False)
     dtype = state.u.dtype
     return Stepping(
-        state, state, jnp.asarray(1.0 / settings.increments, dtype), zero, zero, zero, zero, jnp.zeros((), dtype),
-        no, no, no, no, jnp.full(settings.max_increments, jnp.nan, dtype),
+        state,
+        state,
+        (1.0 / settings.increments) * jnp.ones((), dtype),
+        zero,
+        zero,
+        zero,
+        zero,
+        jnp.zeros((), dtype),
+        no,
+        no,
+        no,
+        no,
+        jnp.full(settings.max_increments, jnp.nan, dtype),
     )
 
 

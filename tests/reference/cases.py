@@ -1,0 +1,83 @@
+"""CalculiX problems stored beside the project, stated with opfem's names.
+
+The reference element is fully integrated, so they are compared with `element="full"`.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import opfem as op
+
+MATERIAL = {"c10": 0.00223, "c01": 0.000703, "bulk": 0.11732}  # MPa
+FIELD = 5.0  # mm
+L0 = 0.5  # mm
+IMPRINT_NODES = 57  # per side, 0.125 mm apart, from -1 to 6 mm
+
+
+def load_case(shared: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read one stored case: arrays and description."""
+    folder = shared / "reference" / "ccx" / "cases"
+    with np.load(folder / f"{name}.npz") as arrays:
+        stored = dict(arrays)
+    return stored, json.loads((folder / f"{name}.json").read_text())
+
+
+def layer(thickness: float = L0) -> op.Layer:
+    """Build the published layer."""
+    return op.Layer(thickness, op.MooneyRivlin(**MATERIAL))
+
+
+def imprint_map(case: dict[str, np.ndarray]) -> op.ThicknessMap:
+    """Read the rigid surface of a coin case as a thickness map."""
+    nodes, uz = case["imprint_nodes"][: IMPRINT_NODES**2], case["imprint_uz"][: IMPRINT_NODES**2]
+    column, row = (np.rint((nodes[:, k] + 1.0) / 0.125).astype(int) for k in (0, 1))
+    values = np.zeros((IMPRINT_NODES, IMPRINT_NODES))
+    values[row, column] = L0 + uz
+    return op.ThicknessMap(values, extent=(7.0, 7.0), origin=(-1.0, -1.0))
+
+
+def nodal_map(case: dict[str, np.ndarray], component: int, n: int) -> np.ndarray:
+    """Arrange one displacement component of the interface nodes as a map `(n+1, n+1)`."""
+    nodes = case["nodes"][case["top_nodes"]]
+    column, row = (np.rint(nodes[:, k] * n / FIELD).astype(int) for k in (0, 1))
+    values = np.zeros((n + 1, n + 1))
+    values[row, column] = case["u"][case["top_nodes"], component]
+    return values
+
+
+def top_stress(case: dict[str, np.ndarray], n: int = 40) -> np.ndarray:
+    """Arrange the reference's mean S33 of the top elements as a map `(n, n)`."""
+    centre = case["nodes"][case["elems"][case["top_elems"]]].mean(axis=1)
+    values = np.zeros((n, n))
+    values[tuple((centre[:, k] * n / FIELD).astype(int) for k in (1, 0))] = case["S_elem_mean"][case["top_elems"], 2]
+    return values
+
+
+def coin(friction_window: float | None, friction_sample: float, stiffness: float, hold: float | None = None) -> op.Palpation:
+    """State a contact case of the coin; no window friction means the window's u_z is held."""
+    window = op.Roller()
+    if friction_window is not None:
+        window = op.Contact(op.LinearOverclosure(10.0), friction_window, stick_slope=0.1)
+    sample = op.Contact(op.LinearOverclosure(stiffness), friction_sample, stick_slope=0.02)
+    return op.Palpation(layer(), (FIELD, FIELD), (40, 40, 4), window, sample, element="full", hold=hold)
+
+
+def normal_force(solution: op.Solution) -> float:
+    """Read the normal force [N], positive in compression."""
+    return -float(solution.stats["force_sample"][2])
+
+
+def relative_error(values, reference: np.ndarray) -> float:
+    """Compute the relative L2 distance of two maps."""
+    return float(np.linalg.norm(np.asarray(values) - reference) / np.linalg.norm(reference))
+
+
+def drifted(thickness: op.ThicknessMap, displacement: np.ndarray) -> op.ThicknessMap:
+    """Move a map against a layer's mean drift (x, y) [mm]."""
+    return op.ThicknessMap(
+        thickness.values, extent=tuple(thickness.extent), origin=tuple(thickness.origin - jnp.asarray(displacement))
+    )
