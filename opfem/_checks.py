@@ -6,9 +6,9 @@ computes. Every message says field, unit, expected, got.
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 
@@ -20,7 +20,7 @@ def as_leaf(value: Any) -> Array:
 
 def concrete(value: Any) -> np.ndarray | None:
     """Return the value as a NumPy array, or None where it is traced."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    return None if isinstance(value, Tracer) else np.asarray(value)
 
 
 def _number(field: str, unit: str, value: Any, holds, expected: str) -> None:

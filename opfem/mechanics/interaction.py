@@ -66,7 +66,7 @@ class TangentLaw(NamedTuple):
     clearance: Float[Array, "points ny nx"] | None
     slope: Float[Array, "points ny nx"]
     sticks: Array
-    curvature: Array = 1.0
+    curvature: Array | float = 1.0
 
     def __call__(self, clearance: Array) -> Array:
         """Evaluate the pressure [MPa]; a closed point may pull for one step."""
@@ -316,7 +316,7 @@ class _Friction(NamedTuple):
     sliding: Array
 
 
-def _scaled_slope(value: Array, share: Array) -> Array:
+def _scaled_slope(value: Array, share: Array | float) -> Array:
     """Keep a value, and a share of its derivative."""
     still = jax.lax.stop_gradient(value)
     return still + share * (value - still)

@@ -62,9 +62,9 @@ def element_geometry(mesh: LayerMesh) -> ElementGeometry:
     fraction = np.arange(nz)[None, :, None, None] + zeta[:, None]
     return ElementGeometry(
         spacing=jnp.stack(mesh.spacing),
-        depth=thickness[:, None] / nz,
-        slope_x=fraction * (d_xi / thickness)[:, None],
-        slope_y=fraction * ((north - south) / thickness)[:, None],
+        depth=jnp.asarray(thickness[:, None] / nz),
+        slope_x=jnp.asarray(fraction * (d_xi / thickness)[:, None]),
+        slope_y=jnp.asarray(fraction * ((north - south) / thickness)[:, None]),
     )
 
 

@@ -204,7 +204,7 @@ def transpose(A: Tensor) -> Tensor:
 
 def product(A: Tensor, B: Tensor) -> Tensor:
     """Multiply two fields of 3×3 matrices, point by point."""
-    return sum(A[:, k, None] * B[None, k] for k in range(3))
+    return A[:, 0, None] * B[None, 0] + A[:, 1, None] * B[None, 1] + A[:, 2, None] * B[None, 2]
 
 
 def outer(A: Tensor, B: Tensor) -> Float[Array, "3 3 3 3 *points"]:

@@ -31,7 +31,8 @@ class LayerMesh(eqx.Module):
     @property
     def node_shape(self) -> tuple[int, int, int]:
         """Shape of a nodal field, (nz+1, ny+1, nx+1)."""
-        return (self.layers + 1, *self.thickness.shape)
+        ny, nx = self.thickness.shape
+        return self.layers + 1, ny, nx
 
     @property
     def spacing(self) -> tuple[Array, Array]:

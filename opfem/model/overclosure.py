@@ -7,7 +7,7 @@ Every law is finite, with a finite slope, for any clearance.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._checks import as_leaf, check_positive
 

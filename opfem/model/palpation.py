@@ -93,4 +93,4 @@ def _sides(sides: str | Mapping[str, str]) -> tuple[str, str, str, str]:
     chosen = dict.fromkeys(SIDES, sides) if isinstance(sides, str) else {**dict.fromkeys(SIDES, "free"), **sides}
     if set(chosen) != set(SIDES) or not set(chosen.values()) <= {"free", "roller"}:
         raise ValueError(f'Palpation.sides must be "free", "roller" or a dict of these by {SIDES}, got {sides!r}.')
-    return tuple(chosen[side] for side in SIDES)
+    return chosen["x0"], chosen["x1"], chosen["y0"], chosen["y1"]

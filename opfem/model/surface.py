@@ -60,7 +60,7 @@ def height_field(values: Float[Array, "my mx"], origin, spacing, interpolation: 
     """
     if interpolation == "cubic":
         my, mx = values.shape
-        values = _spline_prefilter(my) @ values @ _spline_prefilter(mx).T
+        values = jnp.asarray(_spline_prefilter(my)) @ values @ jnp.asarray(_spline_prefilter(mx)).T
     return HeightField(values, jnp.asarray(origin), jnp.asarray(spacing), interpolation)
 
 

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._checks import concrete
 from ..mechanics.face import FaceRule, area_vector, size, surface_tangents, tributary_area
@@ -18,15 +18,14 @@ from ..model import (
     Load,
     Palpation,
     Roller,
+    Side,
     Traction,
     height_field,
 )
 from .equilibrium import Problem, Supports
 
 
-def discretise(
-    palpation: Palpation, load: Load, start: Load | None, rule: FaceRule, approach: Array | None = None
-) -> Problem:
+def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceRule) -> Problem:
     """Build the discrete problem.
 
     Args:
@@ -34,18 +33,15 @@ def discretise(
         load: The load at load fraction 1.
         start: The load at fraction 0; None for the unloaded layer.
         rule: Where contact is integrated.
-        approach: Shift of the sample surface towards the layer [mm], or None.
-
-    Raises:
-        ValueError: If load, start and the sample's support do not fit together.
     """
-    check_compatible(palpation, load, start)
     mesh = palpation.mesh()
     material = palpation.layer.material
     X = mesh.positions()
     stiffness = (material.bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
 
-    def face(contact: Contact, surface: RigidSurface, above: bool, offset=0.0, imposed=None, rule=rule) -> ContactFace:
+    def face(
+        contact, surface: RigidSurface, above: bool, offset: ArrayLike = 0.0, imposed=None, rule=rule
+    ) -> ContactFace:
         return ContactFace(
             contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
         )
@@ -54,18 +50,18 @@ def discretise(
     window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
     sample = dead = imposed = None
     if isinstance(load, Imprint):
-        offset = palpation.sample.law.zero_pressure_clearance - (0.0 if approach is None else approach)
+        offset = _contact(palpation.sample).law.zero_pressure_clearance
         sample = face(palpation.sample, _imprint_surface(palpation, mesh, load, start), True, offset)
     elif isinstance(load, Traction):
         area = tributary_area(X[:, -1])
-        first, last = (_traction(end, mesh) for end in (start, load))
+        first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
         if load.lateral is None:
             _, xi, eta = surface_tangents(X[:, -1], "nodes")
             pressure = ImposedPressure(-first[2], -last[2], size(area_vector(xi, eta)))
             sample = face(palpation.sample, plane, True, imposed=pressure, rule="nodes")
     else:
-        first, last = (_displacement(end, mesh) for end in (start, load))
+        first, last = (_displacement(end if isinstance(end, Displacement) else None, mesh) for end in (start, load))
         imposed = (first, last)
     spring = None
     if palpation.hold is not None:
@@ -75,13 +71,19 @@ def discretise(
     return Problem(body, X, window, sample, dead, imposed, spring, _supports(palpation, load))
 
 
+def _contact(side: Side) -> Contact:
+    assert isinstance(side, Contact)  # check_compatible has seen to it
+    return side
+
+
 def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
     """Raise ValueError where load and sample contradict each other."""
     if not isinstance(load, (Imprint, Traction, Displacement)):
         raise ValueError(f"load must be Imprint, Traction or Displacement, got {type(load).__name__}.")
     if start is not None and type(start) is not type(load):
         raise ValueError(
-            f"A solve continues with the same kind of load: start has {type(start).__name__}, got {type(load).__name__}."
+            f"A solve continues with the same kind of load: expected {type(start).__name__} as in start, "
+            f"got {type(load).__name__}."
         )
     name = type(load).__name__
     if isinstance(load, (Imprint, Traction)) and not isinstance(palpation.sample, Contact):
@@ -144,7 +146,7 @@ def _displacement(load: Displacement | None, mesh: LayerMesh) -> Array:
     return _on_nodes("Displacement.uz", "mm", load.uz, mesh.thickness.shape)
 
 
-def _on_nodes(field: str, unit: str, values: Array, shape: tuple[int, int]) -> Array:
+def _on_nodes(field: str, unit: str, values: Array, shape: tuple[int, ...]) -> Array:
     if values.ndim and values.shape != shape:
         raise ValueError(
             f"{field} [{unit}] must be a number or interface nodes (ny+1, nx+1) = {shape}, got {values.shape}."

@@ -4,7 +4,7 @@ Everything a Newton step needs, with the load fraction as a number from 0 (start
 the friction history of the last converged increment.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ class Supports(NamedTuple):
     sides: tuple[str, str, str, str]
     spring: bool  # an in-plane spring holds the window face
 
-    def free(self, node_shape: tuple[int, int, int]) -> np.ndarray:
+    def free(self, node_shape: tuple[int, ...]) -> np.ndarray:
         """Build the mask of unknowns, 1 where free, `(3, nz+1, ny+1, nx+1)`."""
         free = np.ones((3, *node_shape))
         for side, kind in zip(SIDES, self.sides, strict=True):
@@ -122,11 +122,11 @@ class Problem(eqx.Module):
         internal = forces.internal
         sample = jnp.zeros_like(internal[:, -1])
         window = jnp.zeros_like(internal[:, 0])
-        if self.sample is not None:
+        if self.sample is not None and state.sample is not None:
             sample = self.sample.force(fraction, self.positions[:, -1] + u[:, -1], state.sample, laws.sample)
         if self.dead is not None:
             sample = sample + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1]
-        if self.window is not None:
+        if self.window is not None and state.window is not None:
             window = self.window.force(fraction, self.positions[:, 0] + u[:, 0], state.window, laws.window)
         return forces._replace(sample=sample, window=window)
 
@@ -163,7 +163,7 @@ class Problem(eqx.Module):
             )
         )
 
-    def _faces(self, state: State, each: tuple):
+    def _faces(self, state: State, each: tuple) -> tuple[tuple[ContactFace | None, Any, Any, int], ...]:
         return ((self.window, state.window, each[0], 0), (self.sample, state.sample, each[1], -1))
 
     def reactions(self, forces: Forces) -> Forces:
@@ -195,7 +195,7 @@ class Problem(eqx.Module):
 
     def residual(self, forces: Forces, held: Array) -> Nodal:
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
-        return self.project(self.free * self._unbalanced(forces), held)
+        return self.project(jnp.asarray(self.free) * self._unbalanced(forces), held)
 
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
@@ -241,7 +241,7 @@ class Problem(eqx.Module):
         modes = self.drift_modes()
         if not modes:
             return jnp.zeros_like(unbalanced)
-        return sum(jnp.where(held, jnp.sum(mode * unbalanced), 0.0) * mode for mode in modes)
+        return jnp.sum(jnp.stack([jnp.where(held, jnp.sum(mode * unbalanced), 0.0) * mode for mode in modes]), axis=0)
 
     def tangent(self, u: Nodal, fraction: Array, state: State, laws: TangentLaws) -> tuple[Stencil, Array, Array]:
         """Assemble the tangent.
@@ -282,9 +282,9 @@ class Problem(eqx.Module):
     def advance(self, u: Nodal, fraction: Array, state: State, held: Array) -> State:
         """Build the state at the end of an increment, friction history included."""
         window = sample = None
-        if self.window is not None:
+        if self.window is not None and state.window is not None:
             window = self.window.advance(fraction, self.positions[:, 0] + u[:, 0], state.window)
-        if self.sample is not None:
+        if self.sample is not None and state.sample is not None:
             sample = self.sample.advance(fraction, self.positions[:, -1] + u[:, -1], state.sample)
         return State(u, jnp.asarray(fraction, u.dtype), window, sample, held)
 

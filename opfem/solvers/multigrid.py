@@ -92,8 +92,8 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
 
 
 def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
-    masks = [level.free for level in multigrid.levels] + [multigrid.coarsest_free]
-    return r if masks[depth] is None else r * masks[depth]
+    mask = multigrid.levels[depth].free if depth < len(multigrid.levels) else multigrid.coarsest_free
+    return r if mask is None else r * mask
 
 
 def _smooth(level: Level, r: Nodal) -> tuple[Nodal, Nodal]:

@@ -80,7 +80,7 @@ def _face(
     pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
     traction = force / tributary_area(X)
     zero = jnp.zeros((), x.dtype)
-    if face is None:
+    if face is None or before is None or after is None:
         sticks = support == "bonded"
         status = jnp.full(pressure.shape, STICK if sticks else SLIP)
         slip = jnp.zeros_like(x[:2]) if sticks else state.u[:2, layer]

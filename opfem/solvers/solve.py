@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array
 
 from ..model import Load, Palpation
-from .discretise import discretise
+from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
 from .newton import Newton
 from .progress import LoadProgress
@@ -48,10 +49,11 @@ def solve(
     _require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
+    check_compatible(palpation, load, load_start)
     problem, initial = _prepare(
         palpation, load, load_start, solver, None if start is None else start.last_converged.state
     )
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((problem, initial)))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((problem, initial)))
     run = _run_traced if traced else _run_with_progress
     stepping = run(problem, initial, solver, progress)
     if getattr(load, "correct_approach", False):
@@ -64,10 +66,9 @@ def solve(
 def _prepare(palpation, load, load_start, solver, state: State | None) -> tuple[Problem, Stepping]:
     problem = discretise(palpation, load, load_start, solver.face_rule)
     if state is None:
-        state = problem.initial_state()
-    else:
-        state = eqx.tree_at(lambda s: s.fraction, state, jnp.zeros_like(state.fraction))
-    return problem, begin(state, solver)
+        return problem, begin(problem.initial_state(), solver)
+    restarted = eqx.tree_at(lambda s: s.fraction, state, jnp.zeros_like(state.fraction))
+    return problem, begin(restarted, solver)
 
 
 _attempt = eqx.filter_jit(attempt)
@@ -96,14 +97,10 @@ def _correct_approach(
         )
         # The surface is in place; what is left is one increment at the full load.
         again = begin(stepping.state, solver)
-        before = eqx.tree_at(lambda s: s.fraction, stepping.state, jnp.zeros_like(stepping.state.fraction))
+        state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)
         again = again._replace(
-            state=eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment),
-            before=before,
-            can_release=stepping.can_release,
-            release_failed=stepping.release_failed,
+            state=state, before=state, can_release=stepping.can_release, release_failed=stepping.release_failed
         )
-        again = again._replace(before=again.state)
         stepping_next = run(shifted, again, solver, progress)
         totals = {
             name: getattr(stepping, name) + getattr(stepping_next, name)

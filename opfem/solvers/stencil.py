@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..mechanics.hex8 import pad_axis
+from ..mechanics.hex8 import gather, pad_axis
 
 Stencil = Float[Array, "3 9 3 3 mz my mx"]
 ElementMatrices = Float[Array, "nz 8 8 3 3 ny nx"]
@@ -80,8 +80,6 @@ def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
 
 def held(K: ElementMatrices, free: Nodal) -> ElementMatrices:
     """Zero rows and columns of held unknowns (free = 0) in element matrices."""
-    from ..mechanics.hex8 import gather
-
     mask = jnp.moveaxis(gather(free.astype(K.dtype)), 2, 0)  # nz, a, i, ny, nx
     return K * mask[:, :, None, :, None] * mask[:, None, :, None, :]
 
@@ -89,7 +87,7 @@ def held(K: ElementMatrices, free: Nodal) -> ElementMatrices:
 def column_blocks(S: Stencil) -> Float[Array, "m m my mx"]:
     """Collect each column's own matrix, m = 3 (nz+1) unknowns ordered (z, component)."""
     nodes = S.shape[4]
-    blocks = 0.0
+    blocks = jnp.zeros((nodes, 3, nodes, 3, *S.shape[5:]), S.dtype)
     for dz in range(3):
         places = jnp.eye(nodes, k=dz - 1, dtype=S.dtype)[:, None, :, None, None, None]
         column = jnp.moveaxis(S[dz, 4], 2, 0)  # z, i, j, y, x

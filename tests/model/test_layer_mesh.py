@@ -83,6 +83,6 @@ def test_positions_follow_the_derivative_of_the_map(tilted_map):
         (np.full((3, 4), 0.5), r"a ThicknessMap, got an array of shape \(3, 4\)\. Pass ThicknessMap\(values, extent"),
     ],
 )
-def test_layer_names_field_unit_and_value(thickness, message):
+def test_layer_names_field_unit_and_value(thickness, message, annotations_unchecked):
     with pytest.raises(ValueError, match=message):
         op.Layer(thickness, MATERIAL)

@@ -36,12 +36,12 @@ def test_imprint_takes_a_traced_map():
     assert jax.jit(lowest)(jnp.full((4, 5), 0.45)) == 0.45
 
 
-def test_imprint_refuses_an_unknown_interpolation():
+def test_imprint_refuses_an_unknown_interpolation(annotations_unchecked):
     with pytest.raises(ValueError, match=r"Imprint\.interpolation must be one of .*'cubic'.*, got 'linear'\."):
         op.Imprint(thickness_map(), interpolation="linear")
 
 
-def test_imprint_refuses_a_bare_array():
+def test_imprint_refuses_a_bare_array(annotations_unchecked):
     with pytest.raises(ValueError, match=r"Imprint\.thickness must be a ThicknessMap, got"):
         op.Imprint(np.full((4, 5), 0.45))
 
@@ -75,6 +75,6 @@ def test_displacement_takes_a_number_or_nodes(uz):
         (lambda: op.Displacement(-0.1, lateral="held"), r'Displacement\.lateral must be "free" or "fixed", got \'held\'\.'),
     ],
 )
-def test_constructor_names_field_unit_and_value(make, message):
+def test_constructor_names_field_unit_and_value(make, message, annotations_unchecked):
     with pytest.raises(ValueError, match=message):
         make()

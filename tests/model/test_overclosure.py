@@ -154,6 +154,6 @@ def test_jit_equals_eager_and_vmap_a_loop(law):
         (lambda: op.ExponentialOverclosure("2", 0.01), r"pressure \(p0\) \[MPa\] must be a number, got '2'\."),
     ],
 )
-def test_constructor_names_field_unit_and_value(make, message):
+def test_constructor_names_field_unit_and_value(make, message, annotations_unchecked):
     with pytest.raises(ValueError, match=message):
         make()

@@ -38,7 +38,7 @@ def test_numbers_are_kept():
 
 
 @pytest.mark.parametrize("elements", [(4.0, 2.0, 1.0), np.array([4, 2, 1])])
-def test_whole_numbers_of_another_type_are_counts(elements):
+def test_whole_numbers_of_another_type_are_counts(elements, annotations_unchecked):
     assert palpation(elements=tuple(elements)).elements == (4, 2, 1)
 
 
@@ -61,6 +61,6 @@ def test_whole_numbers_of_another_type_are_counts(elements):
         ({"hold": 0.0}, r"Palpation\.hold \[N/mm\] must be positive, got 0\.0\."),
     ],
 )
-def test_constructor_names_field_unit_and_value(changes, message):
+def test_constructor_names_field_unit_and_value(changes, message, annotations_unchecked):
     with pytest.raises(ValueError, match=message):
         palpation(**changes)
