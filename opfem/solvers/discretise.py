@@ -40,7 +40,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     stiffness = (material.bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
 
     def face(
-        contact, surface: RigidSurface, above: bool, offset: ArrayLike = 0.0, imposed=None, rule=rule
+        contact, surface: RigidSurface, above: bool, offset: ArrayLike = 0.0, imposed=None, rule: FaceRule = rule
     ) -> ContactFace:
         return ContactFace(
             contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
