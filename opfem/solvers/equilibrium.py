@@ -244,29 +244,26 @@ class Problem(eqx.Module):
         return jnp.sum(jnp.stack([jnp.where(held, jnp.sum(mode * unbalanced), 0.0) * mode for mode in modes]), axis=0)
 
     def tangent(self, u: Nodal, fraction: Array, state: State, laws: TangentLaws) -> tuple[Stencil, Array, Array]:
-        """Assemble the tangent.
+        """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
         Returns:
             The exact stencil [N/mm], the guarded element matrices for the preconditioner, and
             a typical stiffness.
         """
-        K = self.body.stiffness(u)
-        guarded = K.astype(jnp.float32)
+        K = guarded = _single(self.body).stiffness(_single(u))
         for face, history, law, layer in self._faces(state, laws):
             if face is not None:
                 exact, guard = face.stiffness_matrices(fraction, self.positions[:, layer] + u[:, layer], history, law)
-                K = _add_face(K, exact, layer)
-                guarded = _add_face(guarded, guard.astype(jnp.float32), layer)
+                K = _add_face(K, _single(exact), layer)
+                guarded = _add_face(guarded, _single(guard), layer)
         hx, hy = self.body.geometry.spacing
         depth = jnp.mean(self.body.geometry.depth)
         scale = self.body.material.shear * hx * hy / depth
         if self.spring is not None:
-            K = _add_face(K, self._foundation(jnp.sum(self.spring)), 0)
+            K = _add_face(K, _single(self._foundation(jnp.sum(self.spring))), 0)
         if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
-            guarded = _add_face(
-                guarded, self._foundation(1e-3 * scale * self.positions[0, 0].size).astype(jnp.float32), 0
-            )
+            guarded = _add_face(guarded, _single(self._foundation(1e-3 * scale * self.positions[0, 0].size)), 0)
         free = self.free
         if not free.all():
             K = held(K, jnp.asarray(free))
@@ -303,6 +300,11 @@ class Problem(eqx.Module):
         sample = None if self.sample is None else self.sample.initial_history(self.positions[:, -1])
         u = jnp.zeros_like(self.positions)
         return State(u, jnp.zeros((), u.dtype), window, sample, jnp.asarray(True))
+
+
+def _single(tree: Any) -> Any:
+    """Turn every floating-point number into float32."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def _add_face(K: Array, face: Array, layer: int) -> Array:

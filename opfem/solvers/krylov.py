@@ -74,7 +74,7 @@ def fgmres(
         right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
         y = _back_substitute(end.R, right)
         x = x + (y.astype(jnp.float32) @ end.Z).reshape(shape).astype(b.dtype)
-        r = b - operator(x)
+        r = b - operator(x).astype(b.dtype)
         return x, r, iterations + end.j, _norm(r)
 
     def unfinished(carry):
@@ -91,7 +91,7 @@ def fgmres(
 def _extend(s: _Basis, operator, preconditioner, shape) -> _Basis:
     j = s.j
     z = preconditioner(s.V[j].reshape(shape)).astype(jnp.float32)
-    w = operator(z.astype(s.V.dtype)).reshape(-1)
+    w = operator(z).astype(s.V.dtype).reshape(-1)
     h = s.V @ w
     w = w - h @ s.V
     again = s.V @ w  # classical Gram–Schmidt twice is as good as modified, and two matrix products
