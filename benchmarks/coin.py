@@ -37,7 +37,7 @@ def interface_error(solution: op.Solution, settings: op.Newton) -> float:
     """Compute the rms distance [µm] of closed contact points from the imprint's own surface."""
     problem = discretise(solution.palpation, solution.load, None, settings.face_rule)
     position = surface_tangents(problem.positions[:, -1] + solution.displacement[:, -1], settings.face_rule)[0]
-    height, slope_x, slope_y = problem.sample.surface.at(jnp.ones(()), position[0], position[1])
+    height, slope_x, slope_y = problem.contacts.sample.surface.at(jnp.ones(()), position[0], position[1])
     distance = np.asarray((height - position[2]) / jnp.sqrt(1.0 + slope_x**2 + slope_y**2))
     start = np.asarray(solution.palpation.sample.law.zero_pressure_clearance)
     closed = distance + start < start  # pressure acts below the law's zero-pressure clearance

@@ -15,7 +15,7 @@ from .hex8 import shifted_sum
 from .kinematics import contract
 
 FaceRule = Literal["gauss2", "gauss3", "nodes"]
-_CORNERS = tuple((x, y) for y, x in itertools.product((0, 1), repeat=2))
+CORNERS = tuple((x, y) for y, x in itertools.product((0, 1), repeat=2))
 
 
 class Quadrature(NamedTuple):
@@ -36,16 +36,16 @@ def quadrature(rule: FaceRule) -> Quadrature:
     y, x = (v.ravel() for v in np.meshgrid(points, points, indexing="ij"))
     wy, wx = np.meshgrid(weights, weights, indexing="ij")
     ends = [(1 - x, x), (1 - y, y)]
-    N = np.stack([ends[0][cx] * ends[1][cy] for cx, cy in _CORNERS], axis=1)
-    d_xi = np.stack([(2 * cx - 1) * ends[1][cy] for cx, cy in _CORNERS], axis=1)
-    d_eta = np.stack([ends[0][cx] * (2 * cy - 1) for cx, cy in _CORNERS], axis=1)
+    N = np.stack([ends[0][cx] * ends[1][cy] for cx, cy in CORNERS], axis=1)
+    d_xi = np.stack([(2 * cx - 1) * ends[1][cy] for cx, cy in CORNERS], axis=1)
+    d_eta = np.stack([ends[0][cx] * (2 * cy - 1) for cx, cy in CORNERS], axis=1)
     return Quadrature(N, np.stack([d_xi, d_eta], axis=1), (wy * wx).ravel())
 
 
 def gather_face(values: Float[Array, "c my mx"]) -> Float[Array, "4 c ny nx"]:
     """Collect the nodal values of every face."""
     ny, nx = values.shape[1] - 1, values.shape[2] - 1
-    return jnp.stack([values[:, y : y + ny, x : x + nx] for x, y in _CORNERS])
+    return jnp.stack([values[:, y : y + ny, x : x + nx] for x, y in CORNERS])
 
 
 def assemble_face(values: Float[Array, "4 *c ny nx"]) -> Float[Array, "*c my mx"]:

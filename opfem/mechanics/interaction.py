@@ -141,6 +141,7 @@ class ContactFace(eqx.Module):
         stiffness: Stiffness of an element per area [MPa/mm], the scale of hard contact.
         above: True for the sample, False for the window.
         rule: Where contact is integrated.
+        rolls: A side face, which the surface only pushes where it has turned towards it.
     """
 
     contact: Contact
@@ -151,6 +152,7 @@ class ContactFace(eqx.Module):
     stiffness: Array
     above: bool = eqx.field(static=True)
     rule: FaceRule = eqx.field(static=True)
+    rolls: bool = eqx.field(static=True, default=False)
 
     def initial_history(self, x: Face) -> SlipHistory:
         """Build the history of a face that has not slipped."""
@@ -263,7 +265,10 @@ class ContactFace(eqx.Module):
         return self.at_points(fraction, y[:3], history, law).traction * area
 
     def _area(self, y: Float[Array, "9 points ny nx"]) -> Float[Array, "points ny nx"]:
-        return size(area_vector(y[3:6], y[6:])) if self.imposed is None else self.imposed.area
+        if self.imposed is not None:
+            return self.imposed.area
+        area = area_vector(y[3:6], y[6:])
+        return jnp.maximum(area[2] if self.above else -area[2], 0.0) if self.rolls else size(area)
 
     def force(self, fraction: Array, x: Face, history: SlipHistory, law: TangentLaw | None = None) -> Face:
         """Compute the nodal force on the layer [N]."""

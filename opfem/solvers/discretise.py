@@ -1,10 +1,13 @@
 """From a palpation and a load to the discrete problem: surfaces, supports and dead forces."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._checks import concrete
+from ..mechanics.boundary import Parts
 from ..mechanics.face import FaceRule, area_vector, size, surface_tangents, tributary_area
 from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
 from ..mechanics.internal import layer_body
@@ -46,6 +49,11 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
             contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
         )
 
+    def sides(face: ContactFace | None) -> ContactFace | None:
+        if face is None or face.imposed is not None or palpation.sides == ("roller",) * 4:
+            return None
+        return dataclasses.replace(face, rolls=True)
+
     plane = RigidSurface(None, None)
     window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
     sample = dead = imposed = None
@@ -68,7 +76,8 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         share = tributary_area(X[:, 0])
         spring = palpation.hold * share / jnp.sum(share)
     body = layer_body(mesh, material, palpation.element)
-    return Problem(body, X, window, sample, dead, imposed, spring, _supports(palpation, load))
+    contacts = Parts(window, sample, sides(window), sides(sample))
+    return Problem(body, X, contacts, dead, imposed, spring, jnp.zeros((), X.dtype), _supports(palpation, load))
 
 
 def _contact(side: Side) -> Contact:

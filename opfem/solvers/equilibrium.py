@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..mechanics.boundary import Parts, add_matrices, put, take
 from ..mechanics.face import tributary_area
-from ..mechanics.interaction import ContactFace, ContactIterate, SlipHistory, TangentLaw
+from ..mechanics.hex8 import assemble, gather
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
 from .stencil import Nodal, Stencil, assemble_stencil, held, with_unit_diagonal
@@ -57,40 +58,26 @@ class State(eqx.Module):
     Attributes:
         u: Displacement [mm].
         fraction: Load fraction [-].
-        window: Friction history at the window, or None.
-        sample: Friction history at the interface, or None.
+        histories: Friction history (`SlipHistory`) of every part of the boundary in contact.
         held: Whether the in-plane hold carries rigid motion.
     """
 
     u: Nodal
     fraction: Float[Array, ""]
-    window: SlipHistory | None
-    sample: SlipHistory | None
+    histories: Parts
     held: Array
 
 
 class Forces(NamedTuple):
-    """Nodal forces on the layer [N] at one state, and the smallest volume ratio."""
+    """Nodal forces on the layer [N] at one state, and the smallest volume ratio.
+
+    `applied` has every part of the boundary: window and sample always, sides where they may touch.
+    """
 
     internal: Nodal
-    sample: Float[Array, "3 my mx"]
-    window: Float[Array, "3 my mx"]
+    applied: Parts
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
-
-
-class TangentLaws(NamedTuple):
-    """Linearised contact laws; None where the face has none, or to take its own law."""
-
-    window: TangentLaw | None
-    sample: TangentLaw | None
-
-
-class ContactIterates(NamedTuple):
-    """What a Newton iteration remembers of both faces; None where a face is not in contact."""
-
-    window: ContactIterate | None
-    sample: ContactIterate | None
 
 
 class Problem(eqx.Module):
@@ -98,11 +85,11 @@ class Problem(eqx.Module):
 
     body: LayerBody
     positions: Nodal
-    window: ContactFace | None
-    sample: ContactFace | None
+    contacts: Parts  # of ContactFace
     dead: tuple[Array, Array] | None  # nodal force at the interface [N], at fraction 0 and 1
     imposed: tuple[Array, Array] | None  # u_z at the interface [mm], at fraction 0 and 1
     spring: Array | None  # in-plane stiffness under each node of the window face [N/mm]
+    viscosity: Array  # of the medium that slows the layer on its way through a snap [-], else 0
     supports: Supports = eqx.field(static=True)
 
     @property
@@ -113,58 +100,49 @@ class Problem(eqx.Module):
     def forces(self, u: Nodal, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
         internal, smallest_J = self.body.internal_force(u)
+        internal = internal + self._drag(self.viscosity) * assemble(_CORNER_SHARE * gather(u - state.u))
         spring = None if self.spring is None else -self.spring * u[:2, 0]
-        forces = Forces(internal, internal[:, -1], internal[:, 0], spring, smallest_J)
-        return self.with_contact(forces, u, fraction, state, TangentLaws(None, None))
+        return self.with_contact(Forces(internal, Parts(), spring, smallest_J), u, fraction, state)
 
-    def with_contact(self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: TangentLaws) -> Forces:
-        """Replace the applied forces by those of the given laws; None means the contact's own."""
-        internal = forces.internal
-        sample = jnp.zeros_like(internal[:, -1])
-        window = jnp.zeros_like(internal[:, 0])
-        if self.sample is not None and state.sample is not None:
-            sample = self.sample.force(fraction, self.positions[:, -1] + u[:, -1], state.sample, laws.sample)
+    def with_contact(
+        self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Parts | None = None
+    ) -> Forces:
+        """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
+        x = self.positions + u
+        applied = self.contacts.map(
+            lambda place, face, history, law: face.force(fraction, take(x, place), history, law),
+            state.histories,
+            laws or Parts(),
+        )
+        zero = jnp.zeros_like(u[:, 0])
+        window, sample = (zero if force is None else force for force in (applied.window, applied.sample))
         if self.dead is not None:
             sample = sample + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1]
-        if self.window is not None and state.window is not None:
-            window = self.window.force(fraction, self.positions[:, 0] + u[:, 0], state.window, laws.window)
-        return forces._replace(sample=sample, window=window)
+        return forces._replace(applied=applied._replace(window=window, sample=sample))
 
-    def tangent_laws(
-        self, u: Nodal, fraction: Array, state: State, iterates: ContactIterates, curvature: Array
-    ) -> TangentLaws:
-        """Linearise contact on both faces."""
-        laws = [
-            None
-            if face is None
-            else face.tangent_law(fraction, self.positions[:, layer] + u[:, layer], history, iterate, curvature)
-            for face, history, iterate, layer in self._faces(state, iterates)
-        ]
-        return TangentLaws(*laws)
-
-    def follow(
-        self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: TangentLaws, length: Array
-    ) -> ContactIterates:
-        """Compute what the next iteration remembers after a step of `length` along `change`."""
-        iterates = [
-            None
-            if face is None
-            else face.follow(fraction, self.positions[:, layer] + u[:, layer], change[:, layer], history, law, length)
-            for face, history, law, layer in self._faces(state, laws)
-        ]
-        return ContactIterates(*iterates)
-
-    def initial_iterates(self, state: State) -> ContactIterates:
-        """Start the iteration from the contact of a converged state."""
-        return ContactIterates(
-            *(
-                None if face is None else face.initial_iterate(history)
-                for face, history, _, _ in self._faces(state, (None, None))
-            )
+    def tangent_laws(self, u: Nodal, fraction: Array, state: State, iterates: Parts, curvature: Array) -> Parts:
+        """Linearise contact (`TangentLaw`)."""
+        x = self.positions + u
+        return self.contacts.map(
+            lambda place, face, history, it: face.tangent_law(fraction, take(x, place), history, it, curvature),
+            state.histories,
+            iterates,
         )
 
-    def _faces(self, state: State, each: tuple) -> tuple[tuple[ContactFace | None, Any, Any, int], ...]:
-        return ((self.window, state.window, each[0], 0), (self.sample, state.sample, each[1], -1))
+    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Parts, length: Array) -> Parts:
+        """Compute what the next iteration remembers (`ContactIterate`) after a step of `length` along `change`."""
+        x = self.positions + u
+        return self.contacts.map(
+            lambda place, face, history, law: face.follow(
+                fraction, take(x, place), take(change, place), history, law, length
+            ),
+            state.histories,
+            laws,
+        )
+
+    def initial_iterates(self, state: State) -> Parts:
+        """Start the iteration from the contact of a converged state."""
+        return self.contacts.map(lambda _, face, history: face.initial_iterate(history), state.histories)
 
     def reactions(self, forces: Forces) -> Forces:
         """Add the reactions of prescribed displacements to the forces of window and sample."""
@@ -179,19 +157,22 @@ class Problem(eqx.Module):
         top, bottom = (
             np.array(prescribed[kind])[:, None, None] for kind in (self.supports.interface, self.supports.window)
         )
+        applied = forces.applied
         return forces._replace(
-            sample=forces.sample + top * unbalanced[:, -1], window=forces.window + bottom * unbalanced[:, 0]
+            applied=applied._replace(
+                sample=applied.sample + top * unbalanced[:, -1], window=applied.window + bottom * unbalanced[:, 0]
+            )
         )
 
     def _unbalanced(self, forces: Forces) -> Nodal:
-        nz = forces.internal.shape[1] - 1
-        window = forces.window
+        unbalanced = forces.internal
+        for place, force in zip(Parts._fields, forces.applied, strict=True):
+            if force is not None:
+                unbalanced = unbalanced - put(force, place, unbalanced.shape)
         if forces.spring is not None:
-            window = window + jnp.concatenate([forces.spring, jnp.zeros_like(forces.spring[:1])])
-        applied = jnp.concatenate(
-            [window[:, None], jnp.zeros_like(forces.internal[:, 1:nz]), forces.sample[:, None]], axis=1
-        )
-        return forces.internal - applied
+            spring = jnp.concatenate([forces.spring, jnp.zeros_like(forces.spring[:1])])
+            unbalanced = unbalanced - put(spring, "window", unbalanced.shape)
+        return unbalanced
 
     def residual(self, forces: Forces, held: Array) -> Nodal:
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
@@ -199,13 +180,13 @@ class Problem(eqx.Module):
 
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
-        forces = self.reactions(forces)
-        applied = jnp.sum(forces.sample**2) + jnp.sum(forces.window**2)
+        applied = self.reactions(forces).applied
+        contact = jnp.sum(applied.sample**2) + jnp.sum(applied.window**2)
         hx, hy = self.body.geometry.spacing
         nodes = self.positions[0, 0].size
         # Below a thousandth of the shear modulus on the whole field, forces count as none.
         floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
-        return jnp.sqrt(applied + floor**2)
+        return jnp.sqrt(contact + floor**2)
 
     def drift_modes(self) -> list[Float[Array, "2 my mx"]]:
         """Build orthonormal rigid motions of the window face that no support prevents.
@@ -243,31 +224,44 @@ class Problem(eqx.Module):
             return jnp.zeros_like(unbalanced)
         return jnp.sum(jnp.stack([jnp.where(held, jnp.sum(mode * unbalanced), 0.0) * mode for mode in modes]), axis=0)
 
-    def tangent(self, u: Nodal, fraction: Array, state: State, laws: TangentLaws) -> tuple[Stencil, Array, Array]:
+    def tangent(self, u: Nodal, fraction: Array, state: State, laws: Parts) -> tuple[Stencil, Array, Array]:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
         Returns:
             The exact stencil [N/mm], the guarded element matrices for the preconditioner, and
             a typical stiffness.
         """
-        K = guarded = _single(self.body).stiffness(_single(u))
-        for face, history, law, layer in self._faces(state, laws):
-            if face is not None:
-                exact, guard = face.stiffness_matrices(fraction, self.positions[:, layer] + u[:, layer], history, law)
-                K = _add_face(K, _single(exact), layer)
-                guarded = _add_face(guarded, _single(guard), layer)
+        K = _single(self.body).stiffness(_single(u))
+        K = K + _single(self._drag(self.viscosity)) * _LUMPED
+        guarded = K
+        x = self.positions + u
+        matrices = self.contacts.map(
+            lambda place, face, history, law: face.stiffness_matrices(fraction, take(x, place), history, law),
+            state.histories,
+            laws,
+        )
+        for place, both in zip(Parts._fields, matrices, strict=True):
+            if both is not None:
+                K = add_matrices(K, _single(both[0]), place)
+                guarded = add_matrices(guarded, _single(both[1]), place)
         hx, hy = self.body.geometry.spacing
         depth = jnp.mean(self.body.geometry.depth)
         scale = self.body.material.shear * hx * hy / depth
         if self.spring is not None:
-            K = _add_face(K, _single(self._foundation(jnp.sum(self.spring))), 0)
+            K = add_matrices(K, _single(self._foundation(jnp.sum(self.spring))), "window")
         if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
-            guarded = _add_face(guarded, _single(self._foundation(1e-3 * scale * self.positions[0, 0].size)), 0)
+            guarded = add_matrices(
+                guarded, _single(self._foundation(1e-3 * scale * self.positions[0, 0].size)), "window"
+            )
         free = self.free
         if not free.all():
             K = held(K, jnp.asarray(free))
         return with_unit_diagonal(assemble_stencil(K), scale), guarded, scale
+
+    def _drag(self, viscosity: Array) -> Array:
+        """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
+        return viscosity * self.body.material.shear * jnp.mean(self.body.geometry.depth)
 
     def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 ny nx"]:
         """Spread an in-plane stiffness [N/mm] evenly over the faces at the window, lumped at nodes."""
@@ -278,12 +272,11 @@ class Problem(eqx.Module):
 
     def advance(self, u: Nodal, fraction: Array, state: State, held: Array) -> State:
         """Build the state at the end of an increment, friction history included."""
-        window = sample = None
-        if self.window is not None and state.window is not None:
-            window = self.window.advance(fraction, self.positions[:, 0] + u[:, 0], state.window)
-        if self.sample is not None and state.sample is not None:
-            sample = self.sample.advance(fraction, self.positions[:, -1] + u[:, -1], state.sample)
-        return State(u, jnp.asarray(fraction, u.dtype), window, sample, held)
+        x = self.positions + u
+        histories = self.contacts.map(
+            lambda place, face, history: face.advance(fraction, take(x, place), history), state.histories
+        )
+        return State(u, jnp.asarray(fraction, u.dtype), histories, held)
 
     def with_imposed(self, u: Nodal, fraction: Array) -> Nodal:
         """Set the prescribed displacements."""
@@ -296,20 +289,16 @@ class Problem(eqx.Module):
 
     def initial_state(self) -> State:
         """Build the undeformed state at load fraction zero."""
-        window = None if self.window is None else self.window.initial_history(self.positions[:, 0])
-        sample = None if self.sample is None else self.sample.initial_history(self.positions[:, -1])
+        histories = self.contacts.map(lambda place, face: face.initial_history(take(self.positions, place)))
         u = jnp.zeros_like(self.positions)
-        return State(u, jnp.zeros((), u.dtype), window, sample, jnp.asarray(True))
+        return State(u, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
+
+
+# A corner's share of its element, and the same for all corners as an element matrix.
+_CORNER_SHARE = 1.0 / 8.0
+_LUMPED = (_CORNER_SHARE * np.eye(8)[:, :, None, None] * np.eye(3))[..., None, None].astype(np.float32)
 
 
 def _single(tree: Any) -> Any:
     """Turn every floating-point number into float32."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
-def _add_face(K: Array, face: Array, layer: int) -> Array:
-    """Add face matrices `(4, 4, 3, 3, ny, nx)` to the bottom (0) or top (-1) element nodes."""
-    first = 0 if layer == 0 else 4
-    at = (0 if layer == 0 else K.shape[0] - 1, first, first, 0, 0, 0, 0)
-    block = jax.lax.dynamic_slice(K, at, (1, *face.shape))
-    return jax.lax.dynamic_update_slice(K, block + face[None], at)

@@ -73,7 +73,7 @@ def fgmres(
         # Columns not reached keep the identity and a zero right-hand side.
         right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
         y = _back_substitute(end.R, right)
-        x = x + (y.astype(jnp.float32) @ end.Z).reshape(shape).astype(b.dtype)
+        x = x + (y @ end.Z).reshape(shape)
         r = b - operator(x).astype(b.dtype)
         return x, r, iterations + end.j, _norm(r)
 

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import check_positive
+from ..mechanics.boundary import Parts
 from ..mechanics.face import FaceRule
-from .equilibrium import ContactIterates, Forces, Problem, State
+from .equilibrium import Forces, Problem, State
 from .krylov import fgmres
 from .multigrid import apply_multigrid, build_multigrid
 from .stencil import Nodal, apply_stencil
@@ -95,7 +96,7 @@ class IncrementResult(NamedTuple):
 
 class _Iterate(NamedTuple):
     u: Nodal
-    contact: ContactIterates
+    contact: Parts  # of ContactIterate
     forces: Forces
     size: Array
     tolerance: Array

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
+from ..mechanics.boundary import Place, take
 from ..mechanics.face import (
     area_vector,
     nodal_area_vector,
@@ -14,7 +15,6 @@ from ..mechanics.face import (
     to_nodes,
     tributary_area,
 )
-from ..mechanics.interaction import ContactFace, SlipHistory
 from ..model import Imprint, Load
 from .equilibrium import Problem, State
 from .solution import OPEN, SLIP, STICK, FaceResult
@@ -40,16 +40,13 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     forces = problem.reactions(problem.forces(u, state.fraction, before))
     hold = problem.hold_force(forces, state.held)
     stress = problem.body.cauchy(u)[2, 2]
-    sample, sample_stats = _face(
-        problem, problem.sample, problem.supports.interface, before.sample, state.sample, forces.sample, state, -1
-    )
-    window, window_stats = _face(
-        problem, problem.window, problem.supports.window, before.window, state.window, forces.window, state, 0
-    )
-    dissipated = [h.dissipated for h in (state.sample, state.window) if h is not None]
+    applied = forces.applied
+    sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample)
+    window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window)
+    dissipated = [history.dissipated for history in state.histories if history is not None]
     stats = {
-        "force_sample": jnp.sum(forces.sample, axis=(1, 2)),
-        "force_window": jnp.sum(forces.window, axis=(1, 2)),
+        "force_sample": _total(applied.sample) + _total(applied.sample_sides),
+        "force_window": _total(applied.window) + _total(applied.window_sides),
         "force_hold": jnp.concatenate([jnp.sum(hold, axis=(1, 2)), jnp.zeros(1, u.dtype)]),
         "strain_energy": problem.body.energy(u),
         "friction_dissipation": sum(dissipated, start=jnp.zeros((), u.dtype)),
@@ -63,35 +60,33 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     return Fields(sample, window, _thickness(problem, u, load), mean, stats)
 
 
+def _total(force: Array | None) -> Array | float:
+    return 0.0 if force is None else jnp.sum(force, axis=(1, 2))
+
+
 def _face(
-    problem,
-    face: ContactFace | None,
-    support: str,
-    before: SlipHistory | None,
-    after: SlipHistory | None,
-    force: Array,
-    state: State,
-    layer: int,
+    problem: Problem, place: Place, support: str, before: State, state: State, force: Array
 ) -> tuple[FaceResult, dict[str, Array]]:
-    X = problem.positions[:, layer]
-    x = X + state.u[:, layer]
+    face, old, new = (getattr(parts, place) for parts in (problem.contacts, before.histories, state.histories))
+    X, u = take(problem.positions, place), take(state.u, place)
+    x = X + u
     area = nodal_area_vector(x)
-    outward = area if layer == -1 else -area
+    outward = area if place == "sample" else -area
     pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
     traction = force / tributary_area(X)
     zero = jnp.zeros((), x.dtype)
-    if face is None or before is None or after is None:
+    if face is None:
         sticks = support == "bonded"
         status = jnp.full(pressure.shape, STICK if sticks else SLIP)
-        slip = jnp.zeros_like(x[:2]) if sticks else state.u[:2, layer]
+        slip = jnp.zeros_like(x[:2]) if sticks else u[:2]
         return FaceResult(pressure, traction, slip, status), {"approach": zero, "max_penetration": zero}
     position, xi, eta = surface_tangents(x, face.rule)
-    point = face.at_points(state.fraction, position, before)
+    point = face.at_points(state.fraction, position, old)
     weight = size(area_vector(xi, eta))
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
     share = to_nodes(jnp.stack([weight, load, load * point.sliding], axis=1), face.rule)
     status = jnp.where(share[1] > 0, jnp.where(share[2] > 0.5 * share[1], SLIP, STICK), OPEN)
-    slip = to_nodes(jnp.moveaxis(after.slip * weight, 1, 0), face.rule) / share[0]
+    slip = to_nodes(jnp.moveaxis(new.slip * weight, 1, 0), face.rule) / share[0]
     total = jnp.sum(load)
     towards = face.contact.law.zero_pressure_clearance - point.clearance
     imposed = face.imposed is not None

@@ -91,9 +91,12 @@ def _correct_approach(
 ) -> tuple[Problem, Stepping]:
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
-        approach = _approach(problem, stepping, load)
+        offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
+        on_sample = [face for face in (problem.contacts.sample, problem.contacts.sample_sides) if face is not None]
         shifted = eqx.tree_at(
-            lambda p: p.sample.offset, problem, palpation.sample.law.zero_pressure_clearance - approach
+            lambda p: [face.offset for face in (p.contacts.sample, p.contacts.sample_sides) if face is not None],
+            problem,
+            [offset] * len(on_sample),
         )
         # The surface is in place; what is left is one increment at the full load.
         again = begin(stepping.state, solver)

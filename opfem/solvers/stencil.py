@@ -64,7 +64,7 @@ def apply_stencil(S: Stencil, u: Nodal) -> Nodal:
                 rows[i] = rows[i] + block[k, i, j] * shifted[j]
         return jnp.stack(rows)
 
-    return jax.lax.fori_loop(0, 3, add_layer, jnp.zeros_like(u))
+    return jax.lax.fori_loop(0, 3, add_layer, jnp.zeros(u.shape, jnp.result_type(S, u)))
 
 
 def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:

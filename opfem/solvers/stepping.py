@@ -1,11 +1,17 @@
-"""Load stepping: increments with cut-back and growth, and the release of the in-plane hold.
+"""Load stepping: increments with cut-back and growth, snaps, and the release of the in-plane hold.
 
-One `attempt` is one load increment tried, accepted or not, as a pure function of its carry; the
+One `attempt` is one equilibrium sought, accepted or not, as a pure function of its carry; the
 solve loops over it on the host (progress, interruption) or inside a trace.
+
+Where a branch of equilibria ends (a bulging side folds onto the window, an edge slips over a ridge)
+no load increment is small enough: the layer snaps. It is then dragged through a viscous medium to
+the full increment, solve by solve, and the medium is taken away as the motion dies out. Only states
+without viscosity are accepted.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -18,6 +24,17 @@ from .solution import RESULTS
 _RELEASE_MARGIN = 0.5
 # Without the hold, an increment is cut down to this share of its full size before the hold returns.
 _LEAST_RELEASED = 0.2
+# Increments cut down to this share of their full size are tried in the viscous medium, unless they
+# are already below the second share.
+_SNAP_SHARES = (0.26, 0.05)
+# Viscosity of the medium: first, changed by this factor, counted as none below, given up above.
+_FIRST_VISCOSITY = 1.5
+_VISCOSITY_FACTOR = 3.0
+_NO_VISCOSITY = 4e-3
+_MOST_VISCOSITY = 100.0
+# Relative residual that is enough on the way, and most Newton steps for it.
+_VISCOUS_RTOL = 1e-4
+_VISCOUS_STEPS = 10
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4
 
@@ -27,9 +44,12 @@ class Stepping(NamedTuple):
 
     Attributes:
         state: Last converged state.
-        before: The converged state that its increment started from.
+        before: The state that its solve started from.
+        origin: The state that the next solve starts from: `state`, or one on its way through a snap.
+        viscosity: Of the medium in the next solve, zero unless the layer snaps [-].
+        speed: Viscosity times the largest move of the last solve in the medium [mm].
         increment: Next load increment [-].
-        attempts: Increments tried.
+        attempts: Solves tried.
         increments: Increments accepted.
         newton: Newton steps of all increments.
         krylov: Preconditioner applications of all increments.
@@ -43,6 +63,9 @@ class Stepping(NamedTuple):
 
     state: State
     before: State
+    origin: State
+    viscosity: Float[Array, ""]
+    speed: Float[Array, ""]
     increment: Float[Array, ""]
     attempts: Array
     increments: Array
@@ -58,22 +81,25 @@ class Stepping(NamedTuple):
 
 def begin(state: State, settings: Newton) -> Stepping:
     """Start at a converged state."""
-    zero, no = jnp.zeros((), int), jnp.asarray(False)
     dtype = state.u.dtype
+    none, zero, no = jnp.zeros((), int), jnp.zeros((), dtype), jnp.asarray(False)
     return Stepping(
-        state,
-        state,
-        (1.0 / settings.increments) * jnp.ones((), dtype),
-        zero,
-        zero,
-        zero,
-        zero,
-        jnp.zeros((), dtype),
-        no,
-        no,
-        no,
-        no,
-        jnp.full(settings.max_increments, jnp.nan, dtype),
+        state=state,
+        before=state,
+        origin=state,
+        viscosity=zero,
+        speed=zero,
+        increment=(1.0 / settings.increments) * jnp.ones((), dtype),
+        attempts=none,
+        increments=none,
+        newton=none,
+        krylov=none,
+        residual=zero,
+        can_release=no,
+        release_failed=no,
+        slides=no,
+        failed=no,
+        fractions=jnp.full(settings.max_increments, jnp.nan, dtype),
     )
 
 
@@ -84,39 +110,77 @@ def unfinished(s: Stepping) -> Array:
 
 
 def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
-    """Try one load increment; keep it if it converges, else return to the last state."""
+    """Try one load increment, or one solve of a snap; keep it if it converges, else return to the last state."""
+    full = 1.0 / settings.increments
     left = 1.0 - s.state.fraction
     increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
     fraction = s.state.fraction + increment
     held = (s.state.held & ~(s.can_release & ~s.release_failed)) | s.release_failed
+    snapping = (s.viscosity > 0) | (s.origin.fraction > s.state.fraction)
     span = s.state.fraction - s.before.fraction
-    ahead = jnp.where(span > 0, increment / jnp.where(span > 0, span, 1.0), 0.0)
-    guess = s.state.u + ahead * (s.state.u - s.before.u)
-    result = solve_increment(problem, s.state, guess, fraction, held, settings)
+    ahead = jnp.where((span > 0) & ~snapping, increment / jnp.where(span > 0, span, 1.0), 0.0)
+    guess = s.origin.u + ahead * (s.state.u - s.before.u)
+    slowed = eqx.tree_at(lambda p: p.viscosity, problem, s.viscosity)
+    on_the_way = (_VISCOUS_RTOL, _VISCOUS_STEPS)
+    limits = [
+        jnp.where(s.viscosity > 0, *both) for both in zip(on_the_way, (settings.rtol, settings.max_steps), strict=True)
+    ]
+    result = solve_increment(
+        slowed, s.origin, guess, fraction, held, eqx.tree_at(lambda n: [n.rtol, n.max_steps], settings, limits)
+    )
     ok = result.converged
-    can_release, slides = _hold_balance(problem, s.state, result.state)
+    accepted = ok & (s.viscosity == 0)
+
+    viscosity, speed = _next_viscosity(s, result.state, ok, result.steps, snapping)
+    begins = ~ok & ~snapping & (increment <= _SNAP_SHARES[0] * full) & (increment > _SNAP_SHARES[1] * full)
+    viscosity = jnp.where(begins, _FIRST_VISCOSITY, viscosity)
+    goes_on = begins | (snapping & ~accepted & (viscosity <= _MOST_VISCOSITY))
+    viscosity = jnp.where(goes_on, viscosity, 0.0)
+    lost = ~accepted & ~goes_on
     # Without the hold and without convergence: cut the increment a few times, then take the hold back.
-    lost_hold = ~ok & ~held & (increment < _LEAST_RELEASED / settings.increments)
-    cut = jnp.where(lost_hold, increment, 0.5 * increment)
-    grown = jnp.minimum(1.5 * s.increment, 1.0 / settings.increments)
+    lost_hold = lost & ~held & (increment < _LEAST_RELEASED * full)
+    cut = jnp.where(lost & ~lost_hold, 0.5 * increment, increment)
+    grown = jnp.minimum(1.5 * s.increment, full)
     grown = jnp.where(result.steps <= settings.max_steps // 2, grown, s.increment)
-    chosen = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (result.state, s.state), (s.state, s.before))
+
+    state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
+    origin = _where(goes_on, _where(ok, result.state, s.origin), state)
+    can_release, slides = _hold_balance(problem, s.origin, result.state)
     attempts = s.attempts + 1
     return Stepping(
-        state=chosen[0],
-        before=chosen[1],
-        increment=jnp.where(ok, grown, cut),
+        state=state,
+        before=before,
+        origin=origin,
+        viscosity=viscosity,
+        speed=speed,
+        increment=jnp.where(accepted, grown, cut),
         attempts=attempts,
-        increments=s.increments + ok,
+        increments=s.increments + accepted,
         newton=s.newton + result.steps,
         krylov=s.krylov + result.krylov,
-        residual=jnp.where(ok, result.residual, s.residual),
-        can_release=jnp.where(ok, can_release, s.can_release),
+        residual=jnp.where(accepted, result.residual, s.residual),
+        can_release=jnp.where(accepted, can_release, s.can_release),
         release_failed=s.release_failed | lost_hold,
-        slides=jnp.where(ok, slides, s.slides),
-        failed=~ok & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
-        fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & ok, fraction, s.fractions),
+        slides=jnp.where(accepted, slides, s.slides),
+        failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
+        fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
     )
+
+
+def _next_viscosity(s: Stepping, state: State, ok: Array, steps: Array, snapping: Array) -> tuple[Array, Array]:
+    """Thicken the medium after a failed solve of a snap; thin it where the motion dies out."""
+    speed = s.viscosity * jnp.max(jnp.abs(state.u - s.origin.u))
+    thinner = jnp.where(
+        (speed < s.speed) & (steps <= _VISCOUS_STEPS // 2), s.viscosity / _VISCOSITY_FACTOR, s.viscosity
+    )
+    thinner = jnp.where(thinner < _NO_VISCOSITY, 0.0, thinner)
+    thicker = _VISCOSITY_FACTOR * jnp.maximum(s.viscosity, _NO_VISCOSITY)
+    viscosity = jnp.where(ok, thinner, thicker)
+    return jnp.where(snapping, viscosity, 0.0), jnp.where(ok & snapping, speed, 0.0)
+
+
+def _where(condition: Array, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def _hold_balance(problem: Problem, before: State, state: State) -> tuple[Array, Array]:
@@ -130,10 +194,10 @@ def _hold_balance(problem: Problem, before: State, state: State) -> tuple[Array,
     moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
     carried = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
     capacity = jnp.zeros((), carried.dtype)
-    for face, force in ((problem.window, forces.window), (problem.sample, forces.sample)):
+    for face, force in zip(problem.contacts, forces.applied, strict=True):
         if face is not None:
             capacity = capacity + face.contact.friction * jnp.abs(jnp.sum(force[2]))
-    normal = jnp.abs(jnp.sum(forces.sample[2]))
+    normal = jnp.abs(jnp.sum(forces.applied.sample[2]))
     return (capacity > 0) & (carried <= _RELEASE_MARGIN * capacity), carried > _BALANCED * normal
 
 

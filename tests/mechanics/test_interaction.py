@@ -84,7 +84,9 @@ def test_force_on_a_flat_face_is_pressure_times_area(law, pressure, above):
     for clearance in (-0.004, 0.004, 0.02):
         x = jnp.array(flat(level - side * clearance))
         force = np.asarray(_force(face, x, face.initial_history(x)))
-        np.testing.assert_allclose(force.sum(axis=(1, 2)), [0, 0, -side * pressure(clearance) * AREA], ROUNDOFF, ROUNDOFF)
+        np.testing.assert_allclose(
+            force.sum(axis=(1, 2)), [0, 0, -side * pressure(clearance) * AREA], ROUNDOFF, ROUNDOFF
+        )
         corner = pressure(clearance) * AREA / (4 * NX * NY)
         np.testing.assert_allclose(np.abs(force[2, ::2, ::2]), corner, 10 * ROUNDOFF, ROUNDOFF)
 
@@ -155,7 +157,7 @@ STATES = {
     "at rest": (0.4, 0.02, 0.0),
     "sticking": (0.4, 0.02, 0.01),
     "sliding": (0.4, 0.02, 0.1),
-    "sticking and sliding": (0.4, 0.02, 0.02),
+    "sticking and sliding": (0.4, 0.02, 0.019),
 }
 
 
@@ -163,7 +165,9 @@ def bumpy_state(state, rough):
     friction, elastic_slip, slip = STATES[state]
     face = bumpy_face(friction, elastic_slip)
     history = face.initial_history(jnp.array(rough))
-    change = slip * (np.array([0.8, 0.6, 0.1])[:, None, None] + 0.2 * np.random.default_rng(1).standard_normal(rough.shape))
+    change = slip * (
+        np.array([0.8, 0.6, 0.1])[:, None, None] + 0.2 * np.random.default_rng(1).standard_normal(rough.shape)
+    )
     return face, jnp.array(rough + change), history
 
 
@@ -176,14 +180,19 @@ def test_stiffness_is_minus_the_derivative_of_force_on_a_curved_surface(state, r
     assert np.mean(point.sliding) == share if share is not None else 0.2 < np.mean(point.sliding) < 0.8
     exact, _ = _matrices(face, x, history)
     expected = -np.asarray(_jacobian(face, x, history)).reshape(x.size, x.size)
-    np.testing.assert_allclose(assemble_dense_face(np.asarray(exact)), expected, ROUNDOFF, ROUNDOFF * np.abs(expected).max())
+    np.testing.assert_allclose(
+        assemble_dense_face(np.asarray(exact)), expected, ROUNDOFF, ROUNDOFF * np.abs(expected).max()
+    )
 
 
 def _points(face, x):
     q = quadrature(face.rule)
     return jnp.array(
         [
-            [[[sum(n * x[c, j + k // 2, i + k % 2] for k, n in enumerate(N)) for i in range(NX)] for j in range(NY)] for N in q.N]
+            [
+                [[sum(n * x[c, j + k // 2, i + k % 2] for k, n in enumerate(N)) for i in range(NX)] for j in range(NY)]
+                for N in q.N
+            ]
             for c in range(3)
         ]
     )
@@ -199,7 +208,9 @@ def test_force_equals_a_loop_over_points(state, rough):
     surface = jax.jit(lambda a, b: face.surface.at(NOW, a, b))
     for j, i, point in itertools.product(range(NY), range(NX), range(4)):
         nodes = [(j + k // 2, i + k % 2) for k in range(4)]
-        now, before = (sum(n * np.asarray(f)[:, *at] for n, at in zip(q.N[point], nodes, strict=True)) for f in (x, rough))
+        now, before = (
+            sum(n * np.asarray(f)[:, *at] for n, at in zip(q.N[point], nodes, strict=True)) for f in (x, rough)
+        )
         tangents = [sum(d * np.asarray(x)[:, *at] for d, at in zip(q.dN[point][k], nodes, strict=True)) for k in (0, 1)]
         height, *slope = (float(v[0]) for v in surface(jnp.array(now[:1]), jnp.array(now[1:2])))
         normal = np.array([-slope[0], -slope[1], 1.0])
@@ -239,7 +250,9 @@ def test_stiffness_is_minus_the_derivative_of_force(name, slip):
     exact, _ = _matrices(face, now, history)
     expected = -np.asarray(_jacobian(face, now, history)).reshape(x.size, x.size)
     assert np.abs(expected).max() > 0
-    np.testing.assert_allclose(assemble_dense_face(np.asarray(exact)), expected, ROUNDOFF, ROUNDOFF * np.abs(expected).max())
+    np.testing.assert_allclose(
+        assemble_dense_face(np.asarray(exact)), expected, ROUNDOFF, ROUNDOFF * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("state", STATES)
@@ -269,7 +282,9 @@ def test_guard_is_the_whole_stiffness_of_a_face_that_just_touches():
 def test_law_linearised_at_its_own_pressure_changes_nothing(state, rough):
     face, x, history = bumpy_state(state, rough)
     point = face.at_points(NOW, _points(face, x), history)
-    law = face.tangent_law(NOW, x, history, ContactIterate(point.pressure, jnp.zeros_like(history.elastic)), jnp.ones(()))
+    law = face.tangent_law(
+        NOW, x, history, ContactIterate(point.pressure, jnp.zeros_like(history.elastic)), jnp.ones(())
+    )
     assert isinstance(law, TangentLaw)
     own, linear = _force(face, x, history), _force(face, x, history, law)
     np.testing.assert_allclose(linear, own, 10 * ROUNDOFF, 10 * ROUNDOFF * np.abs(own).max())

@@ -60,7 +60,11 @@ def element_points(X):
         dN = np.empty((8, 3))
         for a, corner in enumerate(CELL):
             ends = [(t if c else 1 - t, 1.0 if c else -1.0) for t, c in zip(point, corner, strict=True)]
-            dN[a] = [ends[0][1] * ends[1][0] * ends[2][0], ends[0][0] * ends[1][1] * ends[2][0], ends[0][0] * ends[1][0] * ends[2][1]]
+            dN[a] = [
+                ends[0][1] * ends[1][0] * ends[2][0],
+                ends[0][0] * ends[1][1] * ends[2][0],
+                ends[0][0] * ends[1][0] * ends[2][1],
+            ]
         to_X = X.T @ dN
         found.append((dN @ np.linalg.inv(to_X), np.linalg.det(to_X) / 8))
     return found

@@ -57,7 +57,10 @@ def test_numbers_are_leaves():
         (lambda: op.Contact(LAW, friction=-0.1), r"Contact\.friction \[-\] must be zero or positive, got -0\.1\."),
         (lambda: op.Contact(LAW, friction=np.nan), r"Contact\.friction \[-\] must be zero or positive, got nan\."),
         (lambda: op.Contact(LAW, 0.1, elastic_slip=0.0), r"Contact\.elastic_slip \[mm\] must be positive, got 0\.0\."),
-        (lambda: op.Contact(LAW, 0.1, stick_slope=-1.0), r"Contact\.stick_slope \[MPa/mm\] must be positive, got -1\.0\."),
+        (
+            lambda: op.Contact(LAW, 0.1, stick_slope=-1.0),
+            r"Contact\.stick_slope \[MPa/mm\] must be positive, got -1\.0\.",
+        ),
         (
             lambda: op.Contact(LAW, 0.1, elastic_slip=1e-3, stick_slope=30.0),
             r"elastic_slip \[mm\] or stick_slope \[MPa/mm\], got both\. Pass one\.",
@@ -70,5 +73,7 @@ def test_constructor_names_field_unit_and_value(make, message, annotations_unche
 
 
 def test_law_must_be_a_law(annotations_unchecked):
-    with pytest.raises(ValueError, match=r"Contact\.law must be an overclosure law such as HardOverclosure\(\), got 2\.0\."):
+    with pytest.raises(
+        ValueError, match=r"Contact\.law must be an overclosure law such as HardOverclosure\(\), got 2\.0\."
+    ):
         op.Contact(2.0, 0.1)

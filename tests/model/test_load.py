@@ -69,10 +69,16 @@ def test_displacement_takes_a_number_or_nodes(uz):
         (lambda: op.Traction(np.ones(4)), r"Traction\.normal \[MPa\] must be a number or .*, got shape \(4,\)\."),
         (lambda: op.Traction(0.1, lateral=np.ones((3, 4))), r"\(2, ny\+1, nx\+1\), x then y, got shape \(3, 4\)\."),
         (lambda: op.Traction(0.1, lateral=np.ones((3, 3, 4))), r"x then y, got shape \(3, 3, 4\)\."),
-        (lambda: op.Traction(0.1, lateral=np.full((2, 3, 4), np.nan)), r"Traction\.lateral \[MPa\] must be finite, got"),
+        (
+            lambda: op.Traction(0.1, lateral=np.full((2, 3, 4), np.nan)),
+            r"Traction\.lateral \[MPa\] must be finite, got",
+        ),
         (lambda: op.Displacement(np.inf), r"Displacement\.uz \[mm\] must be finite, got inf\."),
         (lambda: op.Displacement(np.ones(3)), r"Displacement\.uz \[mm\] must be a number or .*, got shape \(3,\)\."),
-        (lambda: op.Displacement(-0.1, lateral="held"), r'Displacement\.lateral must be "free" or "fixed", got \'held\'\.'),
+        (
+            lambda: op.Displacement(-0.1, lateral="held"),
+            r'Displacement\.lateral must be "free" or "fixed", got \'held\'\.',
+        ),
     ],
 )
 def test_constructor_names_field_unit_and_value(make, message, annotations_unchecked):

@@ -47,7 +47,11 @@ def tangent_at(material, H, mean_stress):
     return material.tangent(kinematics(H), mean_stress)
 
 
-_stress, _tangent, _energy = eqx.filter_jit(stress), eqx.filter_jit(tangent_at), eqx.filter_jit(lambda m, H: m.energy(H))
+_stress, _tangent, _energy = (
+    eqx.filter_jit(stress),
+    eqx.filter_jit(tangent_at),
+    eqx.filter_jit(lambda m, H: m.energy(H)),
+)
 
 
 def piola(material, F):
@@ -208,7 +212,9 @@ def test_volume_change_of_small_strain_keeps_its_digits(size):
         expected.append(float(sum(F[0][k] * minors[k] for k in range(3)) - 1))
     change = kinematics(jnp.array(np.moveaxis(samples, 0, -1))).volume_change
     np.testing.assert_allclose(change, expected, rtol=ROUNDOFF, atol=0.1 * ROUNDOFF * size)
-    np.testing.assert_allclose(MR20.volumetric_stress(change), BULK * np.array(expected), ROUNDOFF, ROUNDOFF * size * BULK)
+    np.testing.assert_allclose(
+        MR20.volumetric_stress(change), BULK * np.array(expected), ROUNDOFF, ROUNDOFF * size * BULK
+    )
 
 
 def test_volume_change_of_an_isochoric_shear_is_exactly_zero():

@@ -87,7 +87,9 @@ def test_laws_are_finite_a_thousand_clearances_away(law, side):
 def test_slope_equals_a_central_difference(law):
     clearance = C0 * np.array([-7.5, -3.0, -0.2, 0.3, 0.8, 1.5])
     step = 1e-6 * C0
-    difference = (law.pressure(jnp.asarray(clearance + step), SCALE) - law.pressure(jnp.asarray(clearance - step), SCALE)) / (2 * step)
+    difference = (
+        law.pressure(jnp.asarray(clearance + step), SCALE) - law.pressure(jnp.asarray(clearance - step), SCALE)
+    ) / (2 * step)
     slope = pressure_and_slope(law, clearance)[1]
     np.testing.assert_allclose(slope, difference, FINITE_DIFFERENCE, FINITE_DIFFERENCE * np.abs(slope).max())
 

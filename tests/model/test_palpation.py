@@ -52,7 +52,10 @@ def test_whole_numbers_of_another_type_are_counts(elements, annotations_unchecke
         ({"elements": (4, 2)}, r"three whole numbers \(nx, ny, nz\) ≥ 1, got \(4, 2\)\."),
         ({"elements": (4, 0, 1)}, r"three whole numbers \(nx, ny, nz\) ≥ 1, got \(4, 0, 1\)\."),
         ({"elements": (4, 2.5, 1)}, r"three whole numbers \(nx, ny, nz\) ≥ 1, got \(4, 2\.5, 1\)\."),
-        ({"window": "bonded"}, r"Palpation\.window must be Bonded\(\), Roller\(\) or Contact\(law, friction\), got 'bonded'\."),
+        (
+            {"window": "bonded"},
+            r"Palpation\.window must be Bonded\(\), Roller\(\) or Contact\(law, friction\), got 'bonded'\.",
+        ),
         ({"sample": op.HardOverclosure()}, r"Palpation\.sample must be Bonded\(\), Roller\(\) or Contact"),
         ({"element": "reduced"}, r"Palpation\.element must be one of .*'full'.*, got 'reduced'\."),
         ({"sides": "fixed"}, r'Palpation\.sides must be "free", "roller" or a dict .*, got \'fixed\'\.'),

@@ -57,7 +57,9 @@ def top_stress(case: dict[str, np.ndarray], n: int = 40) -> np.ndarray:
     return values
 
 
-def coin(friction_window: float | None, friction_sample: float, stiffness: float, hold: float | None = None) -> op.Palpation:
+def coin(
+    friction_window: float | None, friction_sample: float, stiffness: float, hold: float | None = None
+) -> op.Palpation:
     """State a contact case of the coin; no window friction means the window's u_z is held."""
     window = op.Roller()
     if friction_window is not None:

@@ -25,7 +25,7 @@ def system():
 @partial(jax.jit, static_argnames=("basis", "max_iterations"))
 def solve(A, M, b, rtol, basis, max_iterations=400):
     def times(matrix):
-        return lambda v: (matrix.astype(v.dtype) @ v.reshape(-1)).reshape(v.shape)
+        return lambda v: (matrix @ v.reshape(-1)).reshape(v.shape)
 
     return fgmres(times(A), times(M), b, rtol, basis, max_iterations)
 

@@ -78,7 +78,9 @@ def test_held_unknowns_lose_rows_and_columns(K, free):
 
 def test_unit_diagonal_is_put_only_where_a_row_is_empty(K, free):
     scale = 7.0
-    S = jax.jit(lambda E: with_unit_diagonal(assemble_stencil(held(E, jnp.array(free))), jnp.asarray(scale)))(jnp.array(K))
+    S = jax.jit(lambda E: with_unit_diagonal(assemble_stencil(held(E, jnp.array(free))), jnp.asarray(scale)))(
+        jnp.array(K)
+    )
     u = field(4)
     expected = free.ravel() * (assemble_dense(K) @ (free * u).ravel()) + scale * (1 - free.ravel()) * u.ravel()
     np.testing.assert_allclose(_apply(S, jnp.array(u)).ravel(), expected, ROUNDOFF, ROUNDOFF * np.abs(expected).max())
