@@ -30,11 +30,13 @@ _SNAP_SHARES = (0.26, 0.05)
 # Viscosity of the medium: first, changed by this factor, counted as none below, given up above.
 _FIRST_VISCOSITY = 1.5
 _VISCOSITY_FACTOR = 3.0
-_NO_VISCOSITY = 4e-3
+_NO_VISCOSITY = 1e-6
 _MOST_VISCOSITY = 100.0
 # Relative residual that is enough on the way, and most Newton steps for it.
-_VISCOUS_RTOL = 1e-4
-_VISCOUS_STEPS = 10
+_VISCOUS_RTOL = 1e-6
+_VISCOUS_STEPS = 12
+# Solves of one snap before it is given up.
+_SNAP_SOLVES = 80
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4
 
@@ -49,6 +51,7 @@ class Stepping(NamedTuple):
         viscosity: Of the medium in the next solve, zero unless the layer snaps [-].
         speed: Viscosity times the largest move of the last solve in the medium [mm].
         increment: Next load increment [-].
+        snap_solves: Solves of the snap under way.
         attempts: Solves tried.
         increments: Increments accepted.
         newton: Newton steps of all increments.
@@ -67,6 +70,7 @@ class Stepping(NamedTuple):
     viscosity: Float[Array, ""]
     speed: Float[Array, ""]
     increment: Float[Array, ""]
+    snap_solves: Array
     attempts: Array
     increments: Array
     newton: Array
@@ -90,6 +94,7 @@ def begin(state: State, settings: Newton) -> Stepping:
         viscosity=zero,
         speed=zero,
         increment=(1.0 / settings.increments) * jnp.ones((), dtype),
+        snap_solves=none,
         attempts=none,
         increments=none,
         newton=none,
@@ -134,7 +139,8 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     viscosity, speed = _next_viscosity(s, result.state, ok, result.steps, snapping)
     begins = ~ok & ~snapping & (increment <= _SNAP_SHARES[0] * full) & (increment > _SNAP_SHARES[1] * full)
     viscosity = jnp.where(begins, _FIRST_VISCOSITY, viscosity)
-    goes_on = begins | (snapping & ~accepted & (viscosity <= _MOST_VISCOSITY))
+    going = (viscosity <= _MOST_VISCOSITY) & (s.snap_solves < _SNAP_SOLVES)
+    goes_on = begins | (snapping & ~accepted & going)
     viscosity = jnp.where(goes_on, viscosity, 0.0)
     lost = ~accepted & ~goes_on
     # Without the hold and without convergence: cut the increment a few times, then take the hold back.
@@ -154,6 +160,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         viscosity=viscosity,
         speed=speed,
         increment=jnp.where(accepted, grown, cut),
+        snap_solves=jnp.where(goes_on, s.snap_solves + 1, 0),
         attempts=attempts,
         increments=s.increments + accepted,
         newton=s.newton + result.steps,
@@ -170,9 +177,10 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
 def _next_viscosity(s: Stepping, state: State, ok: Array, steps: Array, snapping: Array) -> tuple[Array, Array]:
     """Thicken the medium after a failed solve of a snap; thin it where the motion dies out."""
     speed = s.viscosity * jnp.max(jnp.abs(state.u - s.origin.u))
-    thinner = jnp.where(
-        (speed < s.speed) & (steps <= _VISCOUS_STEPS // 2), s.viscosity / _VISCOSITY_FACTOR, s.viscosity
-    )
+    dies_out = (speed < s.speed) & (steps <= _VISCOUS_STEPS // 2)
+    easily = steps <= _VISCOUS_STEPS // 4
+    factor = jnp.where(easily, _VISCOSITY_FACTOR**2, _VISCOSITY_FACTOR)
+    thinner = jnp.where(dies_out | (steps == 0), s.viscosity / factor, s.viscosity)
     thinner = jnp.where(thinner < _NO_VISCOSITY, 0.0, thinner)
     thicker = _VISCOSITY_FACTOR * jnp.maximum(s.viscosity, _NO_VISCOSITY)
     viscosity = jnp.where(ok, thinner, thicker)
