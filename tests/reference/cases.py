@@ -78,8 +78,30 @@ def relative_error(values, reference: np.ndarray) -> float:
     return float(np.linalg.norm(np.asarray(values) - reference) / np.linalg.norm(reference))
 
 
-def drifted(thickness: op.ThicknessMap, displacement: np.ndarray) -> op.ThicknessMap:
-    """Move a map against a layer's mean drift (x, y) [mm]."""
-    return op.ThicknessMap(
-        thickness.values, extent=tuple(thickness.extent), origin=tuple(thickness.origin - jnp.asarray(displacement))
-    )
+def rigid_motion(case: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the in-plane rotation `(2, 2)` and shift [mm] about the field's centre that a layer's window face made."""
+    face = np.abs(case["nodes"][:, 2]) < 1e-9
+    X = case["nodes"][face, :2] - FIELD / 2
+    x = X + case["u"][face, :2]
+    shift = x.mean(axis=0)
+    M = (x - shift).T @ X
+    angle = np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]), shift
+
+
+def seen_by_layer(thickness: op.ThicknessMap, rotation: np.ndarray, shift: np.ndarray) -> op.ThicknessMap:
+    """Move a map against a layer's rigid motion."""
+    y, x = np.meshgrid(thickness.y, thickness.x, indexing="ij")
+    x, y = np.einsum("ij,jyx->iyx", rotation, np.stack([x, y]) - FIELD / 2) + (FIELD / 2 + shift)[:, None, None]
+    values = thickness.sample(jnp.asarray(x), jnp.asarray(y))
+    return op.ThicknessMap(values, extent=tuple(thickness.extent), origin=tuple(thickness.origin))
+
+
+def under_body(case: dict[str, np.ndarray], n: int = 40) -> np.ndarray:
+    """Tell which top elements lie under the rigid body, which ends at -1 and 6 mm, as a map `(n, n)`."""
+    corners = (case["nodes"] + case["u"])[case["elems"][case["top_elems"]]]
+    centre = case["nodes"][case["elems"][case["top_elems"]]].mean(axis=1)
+    inside = np.all((corners[..., :2] > -1.0) & (corners[..., :2] < 6.0), axis=(1, 2))
+    values = np.zeros((n, n), bool)
+    values[tuple((centre[:, k] * n / FIELD).astype(int) for k in (1, 0))] = inside
+    return values

@@ -1,20 +1,25 @@
 """opfem against CalculiX: prescribed displacement, friction decks, the coin's contact."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import opfem as op
+from opfem.solvers.discretise import discretise
 from tests.reference.cases import (
     FIELD,
+    L0,
     coin,
-    drifted,
     imprint_map,
     layer,
     load_case,
     nodal_map,
     normal_force,
     relative_error,
+    rigid_motion,
+    seen_by_layer,
     top_stress,
+    under_body,
 )
 
 pytestmark = pytest.mark.slow
@@ -27,19 +32,35 @@ def prescribed(shared, n: int, element: str) -> op.Solution:
 
 
 def test_prescribed_displacement_matches_force_and_stress(shared):
+    """The reference's own displacement is 2e-4 of the forces out of balance; opfem's is not, and 0.1% lower."""
     case, _ = load_case(shared, "coin_presc_uz_bottom_slip_C3D8")
     solution = prescribed(shared, 40, "full")
     assert normal_force(solution) == pytest.approx(0.13587, rel=0.005)
     assert relative_error(solution.stress_zz, top_stress(case)) < 0.005
 
 
+def test_the_references_own_displacement_gives_its_force(shared):
+    case, _ = load_case(shared, "coin_presc_uz_bottom_slip_C3D8")
+    solution = prescribed(shared, 40, "full")
+    nz, ny, nx = (n - 1 for n in solution.positions.shape[1:])
+    at = [np.rint(case["nodes"][:, k] * n / e).astype(int) for k, n, e in ((2, nz, L0), (1, ny, FIELD), (0, nx, FIELD))]
+    u = np.zeros(solution.positions.shape)
+    u[:, *at] = case["u"].T
+    body = discretise(solution.palpation, solution.load, None, "gauss2").body
+    force, _ = body.internal_force(jnp.asarray(u))
+    assert -float(force[2, -1].sum()) == pytest.approx(0.1358679, rel=1e-6)
+
+
 def test_mean_dilatation_refines_towards_quadratic_elements(shared):
-    # C3D20R at 40x40x4: 0.13469 N; full integration at the same meshes: 0.13639, 0.13587, 0.13532 N.
-    forces = [normal_force(prescribed(shared, n, "mean_dilatation")) for n in (20, 40, 80)]
-    errors = np.abs(np.array(forces) - 0.1347)
-    assert errors[1] < 0.005 * 0.1347
-    assert errors[2] <= errors[1] + 1e-4
-    assert errors[2] < 0.003 * 0.1347
+    """Quadratic elements (C3D20R, 40x40x4) give 0.1347 N; with refinement the two forms close in on each other."""
+    forces = {
+        n: [normal_force(prescribed(shared, n, form)) for form in ("mean_dilatation", "full")] for n in (20, 40, 80)
+    }
+    gaps = [abs(full - mean) for mean, full in forces.values()]
+    for mean, _ in forces.values():
+        assert mean == pytest.approx(0.1347, rel=0.005)
+    assert gaps[1] < 0.7 * gaps[0]
+    assert gaps[2] < 0.7 * gaps[1]
 
 
 @pytest.mark.parametrize(
@@ -77,14 +98,22 @@ def test_smoothed_coin_with_friction_matches_force_and_stress(shared, name, wind
     assert relative_error(solution.stress_zz, top_stress(case)) < 0.05
 
 
-def test_sharp_frictionless_coin_matches_where_the_reference_drifted_to(shared):
-    # Without friction the reference drifts by 0.15 mm on weak springs; opfem holds the layer, so the
-    # map is moved instead.
+def test_smoothed_coin_without_friction_matches_where_the_reference_drifted_to(shared):
+    """On springs of 1e-7 N/mm the reference's layer slid by 0.95 mm and turned by 13 degrees, partly off the body.
+
+    Its equilibrium there is almost neutral: opfem holds the layer and moves the map instead. Where the
+    reference's body has ended, the map goes on; those 4% of the elements are left out of the stress.
+    """
+    case, _ = load_case(shared, "smoothcoin_mutop0_bottom_slip_C3D8")
+    solution = op.solve(coin(None, 0.0, 20.0), op.Imprint(seen_by_layer(imprint_map(case), *rigid_motion(case))))
+    assert normal_force(solution) == pytest.approx(0.11350, rel=0.02)
+    under = under_body(case)
+    assert under.mean() > 0.9
+    assert relative_error(np.asarray(solution.stress_zz)[under], top_stress(case)[under]) < 0.05
+
+
+def test_sharp_coin_without_friction_is_close_where_the_reference_drifted_to(shared):
+    """Slopes up to 0.57: how the surface is interpolated between nodes moves the force by several per cent."""
     case, _ = load_case(shared, "coin_ccxcontact_top_mu0_bottom_slip_C3D8")
-    bottom = np.abs(case["nodes"][:, 2]) < 1e-9
-    drift = case["u"][bottom, :2].mean(axis=0)
-    load = op.Imprint(drifted(imprint_map(case), drift))
-    solution = op.solve(coin(None, 0.0, 20.0), load)
+    solution = op.solve(coin(None, 0.0, 20.0), op.Imprint(seen_by_layer(imprint_map(case), *rigid_motion(case))))
     assert normal_force(solution) == pytest.approx(0.14012, rel=0.10)
-    lateral = np.abs(np.asarray(solution.stats["force_hold"])).max()
-    assert lateral < 0.005 * normal_force(solution)
