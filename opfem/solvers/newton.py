@@ -34,7 +34,8 @@ class Newton(eqx.Module):
 
     The load is applied in `increments` equal parts. An increment that does not converge is cut
     and repeated from the last converged state, its friction history restored; increments grow
-    again up to that size.
+    again up to that size. Where the layer snaps and no increment helps, it is taken through a viscous
+    medium (`stepping`).
 
     Args:
         rtol: Unbalanced force over contact force [-] at convergence (Euclidean norms).

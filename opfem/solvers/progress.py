@@ -35,6 +35,7 @@ class LoadProgress:
     ) -> None:
         self._bar.stop()
 
-    def show(self, fraction: float, attempts: int, newton: int) -> None:
+    def show(self, fraction: float, attempts: int, newton: int, snaps: bool) -> None:
         """Update the bar."""
-        self._bar.update(self._task, completed=fraction, description=f"increment {attempts}, {newton} Newton steps")
+        text = f"solve {attempts}, {newton} Newton steps" + (", snapping" if snaps else "")
+        self._bar.update(self._task, completed=fraction, description=text)

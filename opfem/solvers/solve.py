@@ -78,7 +78,8 @@ def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, pro
     with LoadProgress(progress) as bar:
         while bool(unfinished(stepping)):
             stepping = _attempt(problem, stepping, solver)
-            bar.show(float(stepping.state.fraction), int(stepping.attempts), int(stepping.newton))
+            s = stepping
+            bar.show(float(s.state.fraction), int(s.attempts), int(s.newton), bool(s.viscosity > 0))
     return stepping
 
 

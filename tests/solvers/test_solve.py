@@ -125,6 +125,28 @@ def test_cut_back_restores_the_state_and_equals_asking_for_the_smaller_increment
     np.testing.assert_array_equal(after_cut.state.histories.window.elastic, asked.state.histories.window.elastic)
 
 
+def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
+    """Without friction the path does not count, so the viscous medium must lead to the state of a direct solve."""
+    from opfem.solvers.solve import _attempt, _prepare
+
+    settings = op.Newton(increments=4).as_leaves()
+    problem, start = _prepare(palpation(0.0, 0.0), op.Imprint(bumpy()), None, settings, None)
+    direct = _attempt(problem, start, settings)
+    snap = start._replace(viscosity=jnp.asarray(1.5))
+    on_the_way = 0
+    while not int(snap.increments):
+        snap = _attempt(problem, snap, settings)
+        if not int(snap.increments):
+            on_the_way += 1
+            assert float(snap.state.fraction) == 0.0
+            assert float(snap.origin.fraction) == 0.25
+            np.testing.assert_array_equal(snap.state.u, start.state.u)
+    assert 1 < on_the_way < 40
+    assert float(snap.viscosity) == 0.0
+    assert float(snap.residual) <= 1e-7
+    np.testing.assert_allclose(snap.state.u, direct.state.u, atol=SOLVER)
+
+
 def test_start_continues_with_history():
     whole = op.solve(palpation(), op.Imprint(bumpy()), op.Newton(increments=4))
     half_map = op.ThicknessMap(0.5 * (0.5 + bumpy().values), extent=SIZE)
