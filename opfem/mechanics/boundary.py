@@ -97,8 +97,8 @@ def _add(K: Array, face: Array, corners: list[tuple[int, int, int]], z: int, y: 
     to_element = np.zeros((8, 4))
     to_element[[CORNERS.index(corner) for corner in corners], range(4)] = 1.0
     pairs = np.einsum("aA,bB->abAB", to_element, to_element).reshape(8, 8, 16)
-    flat = jnp.moveaxis(face, 0, 2).reshape(16, *jnp.moveaxis(face, 0, 2).shape[2:])
-    whole = jnp.moveaxis(contract(pairs, flat), 2, 0)
+    face = jnp.moveaxis(face, 0, 2)
+    whole = jnp.moveaxis(contract(pairs, face.reshape(16, *face.shape[2:])), 2, 0)
     at = (z, 0, 0, 0, 0, y, x)
     block = jax.lax.dynamic_slice(K, at, whole.shape)
     return jax.lax.dynamic_update_slice(K, block + whole, at)

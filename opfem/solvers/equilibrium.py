@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from ..mechanics.boundary import Parts, add_matrices, put, take
 from ..mechanics.face import tributary_area
-from ..mechanics.hex8 import assemble, gather
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
 from .stencil import Nodal, Stencil, assemble_stencil, held, with_unit_diagonal
@@ -100,7 +99,7 @@ class Problem(eqx.Module):
     def forces(self, u: Nodal, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
         internal, smallest_J = self.body.internal_force(u)
-        internal = internal + self._drag(self.viscosity) * assemble(_CORNER_SHARE * gather(u - state.u))
+        internal = internal + self._drag(self.viscosity) * _node_share(u.shape[1:]) * (u - state.u)
         spring = None if self.spring is None else -self.spring * u[:2, 0]
         return self.with_contact(Forces(internal, Parts(), spring, smallest_J), u, fraction, state)
 
@@ -294,9 +293,14 @@ class Problem(eqx.Module):
         return State(u, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
 
 
-# A corner's share of its element, and the same for all corners as an element matrix.
-_CORNER_SHARE = 1.0 / 8.0
-_LUMPED = (_CORNER_SHARE * np.eye(8)[:, :, None, None] * np.eye(3))[..., None, None].astype(np.float32)
+# Every corner's share of its element, as an element matrix.
+_LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3))[..., None, None].astype(np.float32)
+
+
+def _node_share(shape: tuple[int, ...]) -> np.ndarray:
+    """Compute how many elements' worth each node has: 1 inside, half on a face: `_LUMPED` assembled."""
+    z, y, x = (np.where(np.isin(np.arange(n), (0, n - 1)), 0.5, 1.0) for n in shape)
+    return z[:, None, None] * y[:, None] * x
 
 
 def _single(tree: Any) -> Any:

@@ -103,7 +103,11 @@ def _correct_approach(
         again = begin(stepping.state, solver)
         state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)
         again = again._replace(
-            state=state, before=state, can_release=stepping.can_release, release_failed=stepping.release_failed
+            state=state,
+            before=state,
+            origin=state,
+            can_release=stepping.can_release,
+            release_failed=stepping.release_failed,
         )
         stepping_next = run(shifted, again, solver, progress)
         totals = {
