@@ -17,7 +17,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import opfem as op  # noqa: E402
-from opfem.mechanics.face import surface_tangents  # noqa: E402
+from opfem.mechanics.face import gather_face, surface_tangents  # noqa: E402
 from opfem.solvers.discretise import discretise  # noqa: E402
 
 
@@ -36,7 +36,8 @@ def experiment(n: int, element: str, c10: float, window: float, sample: float) -
 def interface_error(solution: op.Solution, settings: op.Newton) -> float:
     """Compute the rms distance [µm] of closed contact points from the imprint's own surface."""
     problem = discretise(solution.palpation, solution.load, None, settings.face_rule)
-    position = surface_tangents(problem.positions[:, -1] + solution.displacement[:, -1], settings.face_rule)[0]
+    corners = gather_face(problem.positions[:, -1] + solution.displacement[:, -1])
+    position = surface_tangents(corners, settings.face_rule)[0]
     height, slope_x, slope_y = problem.contacts.sample.surface.at(jnp.ones(()), position[0], position[1])
     distance = np.asarray((height - position[2]) / jnp.sqrt(1.0 + slope_x**2 + slope_y**2))
     start = np.asarray(solution.palpation.sample.law.zero_pressure_clearance)

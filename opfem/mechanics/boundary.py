@@ -13,76 +13,123 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .face import CORNERS as FACE_CORNERS
+from .face import CORNERS as FACE_CORNERS, assemble_face, gather_face
 from .hex8 import CORNERS
 from .kinematics import contract
 
-Place = Literal["window", "sample", "window_sides", "sample_sides"]
-Face = Float[Array, "3 rows columns"]
+Body = Literal["window", "sample"]
 Nodal = Float[Array, "3 mz my mx"]
+Corners = Float[Array, "4 c faces"]
 
 
-class Parts(NamedTuple):
-    """One thing for each part of the boundary that may touch a body; None where it cannot."""
+class Bodies(NamedTuple):
+    """One thing for each rigid body; None where the layer cannot touch it."""
 
     window: Any = None
     sample: Any = None
-    window_sides: Any = None
-    sample_sides: Any = None
 
-    def map(self, function: Callable, *others: "Parts") -> "Parts":
-        """Apply a function to every part that is there, with its place first."""
-        return Parts(
+    def map(self, function: Callable, *others: "Bodies") -> "Bodies":
+        """Apply a function to every body that is there, with its name first."""
+        return Bodies(
             *(
-                None if mine is None else function(place, mine, *rest)
-                for place, mine, *rest in zip(self._fields, self, *others, strict=True)
+                None if mine is None else function(body, mine, *rest)
+                for body, mine, *rest in zip(self._fields, self, *others, strict=True)
             )
         )
 
 
-def take(u: Nodal, place: str) -> Face:
-    """Take the nodal values of one part of the boundary."""
-    if place in ("window", "sample"):
-        return u[:, 0 if place == "window" else -1]
-    sides = [u[:, :, 0, :-1], u[:, :, :-1, -1], u[:, :, -1, :0:-1], u[:, :, :0:-1, 0], u[:, :, 0, :1]]
-    return jnp.concatenate(sides, axis=-1)[:, _layers(u.shape[1] - 1, place, nodes=True)]
+class Touching(NamedTuple):
+    """Nodal values of all that may touch one body: the face, and its half of the sides or None."""
+
+    face: Float[Array, "c my mx"]
+    sides: Float[Array, "c rows columns"] | None
+
+    @property
+    def total(self) -> Float[Array, " c"]:
+        """The sum over all nodes."""
+        face = jnp.sum(self.face, axis=(1, 2))
+        return face if self.sides is None else face + jnp.sum(self.sides, axis=(1, 2))
 
 
-def put(f: Face, place: str, shape: tuple[int, ...]) -> Nodal:
-    """Add the nodal values of one part into a zero nodal field: the transpose of `take`."""
+def take(u: Nodal, body: str, with_sides: bool) -> Corners:
+    """Take the nodal values at the corners of all faces that may touch a body, those of the sides last."""
+    corners = gather_face(u[:, _level(u.shape[1], body)]).reshape(4, 3, -1)
+    if not with_sides:
+        return corners
+    strip = [u[:, :, 0, :-1], u[:, :, :-1, -1], u[:, :, -1, :0:-1], u[:, :, :0:-1, 0], u[:, :, 0, :1]]
+    strip = jnp.concatenate(strip, axis=-1)[:, _layers(u.shape[1] - 1, body, nodes=True)]
+    return jnp.concatenate([corners, gather_face(strip).reshape(4, 3, -1)], axis=-1)
+
+
+def to_touching(corners: Corners, elements: tuple[int, int, int]) -> Touching:
+    """Add corner values into nodes.
+
+    Args:
+        corners: Corner values, ordered as `take` does.
+        elements: Elements (nz, ny, nx).
+    """
+    face, sides = _split(corners, elements)
+    return Touching(assemble_face(face), None if sides is None else assemble_face(sides))
+
+
+def put(values: Touching, body: str, shape: tuple[int, ...]) -> Nodal:
+    """Add the nodal values of what touches a body into a zero nodal field."""
     mz, my, mx = shape[1:]
-    if place in ("window", "sample"):
-        return _placed(f[:, None], shape, z=0 if place == "window" else mz - 1)
-    layers = _layers(mz - 1, place, nodes=True)
-    f = jnp.concatenate([f[..., :1] + f[..., -1:], f[..., 1:-1]], axis=-1)
-    south, east, north, west = jnp.split(f, np.cumsum([mx - 1, my - 1, mx - 1]), axis=-1)
+    whole = _placed(values.face[:, None], shape, z=_level(mz, body))
+    if values.sides is None:
+        return whole
+    z = _layers(mz - 1, body, nodes=True).start
+    sides = jnp.concatenate([values.sides[..., :1] + values.sides[..., -1:], values.sides[..., 1:-1]], axis=-1)
+    south, east, north, west = jnp.split(sides, np.cumsum([mx - 1, my - 1, mx - 1]), axis=-1)
     return (
-        _placed(south[:, :, None, :], shape, layers.start)
-        + _placed(east[:, :, :, None], shape, layers.start, x=mx - 1)
-        + _placed(north[:, :, None, ::-1], shape, layers.start, y=my - 1, x=1)
-        + _placed(west[:, :, ::-1, None], shape, layers.start, y=1)
+        whole
+        + _placed(south[:, :, None, :], shape, z)
+        + _placed(east[:, :, :, None], shape, z, x=mx - 1)
+        + _placed(north[:, :, None, ::-1], shape, z, y=my - 1, x=1)
+        + _placed(west[:, :, ::-1, None], shape, z, y=1)
     )
 
 
-def add_matrices(K: Array, face: Float[Array, "4 4 3 3 rows columns"], place: str) -> Array:
-    """Add face matrices to element matrices `(nz, 8, 8, 3, 3, ny, nx)`."""
+def add_matrices(K: Array, matrices: Float[Array, "4 4 3 3 faces"], body: str) -> Array:
+    """Add face matrices, ordered as `take` does, to element matrices `(nz, 8, 8, 3, 3, ny, nx)`."""
     nz, ny, nx = K.shape[0], *K.shape[-2:]
-    if place in ("window", "sample"):
-        corners = [(x, y, int(place == "sample")) for x, y in FACE_CORNERS]
-        return _add(K, face[None], corners, z=0 if place == "window" else nz - 1)
-    face = jnp.moveaxis(face, 4, 0)  # layers first
-    south, east, north, west = jnp.split(face, np.cumsum([nx, ny, nx]), axis=-1)
-    first = _layers(nz, place, nodes=False).start
+    face, sides = _split(matrices, (nz, ny, nx))
+    corners = [(x, y, int(body == "sample")) for x, y in FACE_CORNERS]
+    K = _add(K, face[None], corners, z=_level(nz, body))
+    if sides is None:
+        return K
+    sides = jnp.moveaxis(sides, 4, 0)  # layers first
+    south, east, north, west = jnp.split(sides, np.cumsum([nx, ny, nx]), axis=-1)
+    first = _layers(nz, body, nodes=False).start
     K = _add(K, south[..., None, :], [(s, 0, z) for s, z in FACE_CORNERS], first)
     K = _add(K, east[..., :, None], [(1, s, z) for s, z in FACE_CORNERS], first, x=nx - 1)
     K = _add(K, north[..., None, ::-1], [(1 - s, 1, z) for s, z in FACE_CORNERS], first, y=ny - 1)
     return _add(K, west[..., ::-1, None], [(0, 1 - s, z) for s, z in FACE_CORNERS], first)
 
 
-def _layers(nz: int, place: str, nodes: bool) -> slice:
+def is_side(elements: tuple[int, int, int]) -> np.ndarray:
+    """Tell which faces that `take` gives are sides, `(faces,)`."""
+    nz, ny, nx = elements
+    return np.arange(ny * nx + (nz + 1) // 2 * 2 * (nx + ny)) >= ny * nx
+
+
+def _split(values: Array, elements: tuple[int, int, int]) -> tuple[Array, Array | None]:
+    """Split values of all faces that may touch a body into the face's own and the sides', as grids."""
+    nz, ny, nx = elements
+    face = values[..., : ny * nx].reshape(*values.shape[:-1], ny, nx)
+    if values.shape[-1] == ny * nx:
+        return face, None
+    return face, values[..., ny * nx :].reshape(*values.shape[:-1], (nz + 1) // 2, 2 * (nx + ny))
+
+
+def _level(n: int, body: str) -> int:
+    return 0 if body == "window" else n - 1
+
+
+def _layers(nz: int, body: str, nodes: bool) -> slice:
     """Rows of the strip of sides that belong to a body: its own half of the layer."""
     half = (nz + 1) // 2
-    first = 0 if place == "window_sides" else nz - half
+    first = 0 if body == "window" else nz - half
     return slice(first, first + half + nodes)
 
 

@@ -55,17 +55,22 @@ def assemble_face(values: Float[Array, "4 *c ny nx"]) -> Float[Array, "*c my mx"
     return shifted_sum(rows[0], rows[1], axis=-2)
 
 
+def to_corners(values: Float[Array, "points *c_faces"], rule: FaceRule) -> Float[Array, "4 *c_faces"]:
+    """Integrate a density per unit of (ξ, η) against the shape functions of each face's corners."""
+    q = quadrature(rule)
+    return contract((q.N * q.weights[:, None]).T, values)
+
+
 def to_nodes(values: Float[Array, "points *c ny nx"], rule: FaceRule) -> Float[Array, "*c my mx"]:
     """Integrate a density per unit of (ξ, η) against the nodal shape functions."""
-    q = quadrature(rule)
-    return assemble_face(contract((q.N * q.weights[:, None]).T, values))
+    return assemble_face(to_corners(values, rule))
 
 
-def surface_tangents(x: Float[Array, "3 my mx"], rule: FaceRule) -> tuple[Array, Array, Array]:
-    """Compute position and tangents dx/dξ, dx/dη at the points, each `(3, points, ny, nx)`."""
+def surface_tangents(corners: Float[Array, "4 3 *faces"], rule: FaceRule) -> tuple[Array, Array, Array]:
+    """Compute position and tangents dx/dξ, dx/dη at the points, each `(3, points, *faces)`."""
     q = quadrature(rule)
     both = np.concatenate([q.N[:, None], q.dN], axis=1)
-    at_points = contract(both, gather_face(x))
+    at_points = contract(both, corners)
     position, xi, eta = (jnp.moveaxis(at_points[:, k], 1, 0) for k in range(3))
     return position, xi, eta
 
@@ -77,13 +82,13 @@ def area_vector(xi: Float[Array, "3 *points"], eta: Float[Array, "3 *points"]) -
 
 def nodal_area_vector(x: Float[Array, "3 my mx"]) -> Float[Array, "3 my mx"]:
     """Integrate n da against the nodal shape functions [mm²]."""
-    _, xi, eta = surface_tangents(x, "gauss2")
+    _, xi, eta = surface_tangents(gather_face(x), "gauss2")
     return to_nodes(jnp.moveaxis(area_vector(xi, eta), 1, 0), "gauss2")
 
 
 def tributary_area(x: Float[Array, "3 my mx"]) -> Float[Array, "my mx"]:
     """Compute each node's share of the area [mm²], lumped at the nodes."""
-    _, xi, eta = surface_tangents(x, "nodes")
+    _, xi, eta = surface_tangents(gather_face(x), "nodes")
     return to_nodes(size(area_vector(xi, eta)), "nodes")
 
 

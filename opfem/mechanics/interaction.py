@@ -1,4 +1,4 @@
-"""Contact and friction of one face of the layer with a rigid surface, at its face points.
+"""Contact and friction of faces of the layer with a rigid surface, at their face points.
 
 Pressure follows the overclosure law along the surface's true normal, on the current area.
 Friction is Coulomb's with elastic slip and a return map; the slip of a point is measured along
@@ -11,32 +11,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..model import Contact, HeightField
-from .face import FaceRule, area_vector, gather_face, quadrature, size, surface_tangents, to_nodes
+from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
 
-Face = Float[Array, "3 my mx"]
-PointVector = Float[Array, "3 points ny nx"]
+Corners = Float[Array, "4 3 *faces"]  # nodal values at the corners of every face
+PointVector = Float[Array, "3 points *faces"]
 
 
 class SlipHistory(eqx.Module):
     """What friction remembers at the end of an increment, per face point.
 
     Attributes:
-        position: (x, y) of the points `(2, points, ny, nx)` [mm].
-        elastic: Elastic part of the slip `(2, points, ny, nx)` [mm].
-        slip: Slip slid so far, along x and y `(2, points, ny, nx)` [mm].
+        position: (x, y) of the points `(2, points, *faces)` [mm].
+        elastic: Elastic part of the slip `(2, points, *faces)` [mm].
+        slip: Slip slid so far, along x and y `(2, points, *faces)` [mm].
         dissipated: Work done by friction so far on the whole face [N mm].
         pressure: Contact pressure at the points [MPa], where the next increment starts from.
     """
 
-    position: Float[Array, "2 points ny nx"]
-    elastic: Float[Array, "2 points ny nx"]
-    slip: Float[Array, "2 points ny nx"]
+    position: Float[Array, "2 points *faces"]
+    elastic: Float[Array, "2 points *faces"]
+    slip: Float[Array, "2 points *faces"]
     dissipated: Float[Array, ""]
-    pressure: Float[Array, "points ny nx"]
+    pressure: Float[Array, "points *faces"]
 
 
 class ContactIterate(NamedTuple):
@@ -44,12 +44,12 @@ class ContactIterate(NamedTuple):
 
     Attributes:
         pressure: Contact pressure at the points [MPa], an unknown of its own.
-        direction: Slip that a sliding point had in the last step `(2, points, ny, nx)` [mm], zero
+        direction: Slip that a sliding point had in the last step `(2, points, *faces)` [mm], zero
             where it stuck.
     """
 
-    pressure: Float[Array, "points ny nx"]
-    direction: Float[Array, "2 points ny nx"]
+    pressure: Float[Array, "points *faces"]
+    direction: Float[Array, "2 points *faces"]
 
 
 class TangentLaw(NamedTuple):
@@ -62,9 +62,9 @@ class TangentLaw(NamedTuple):
     along its slip, so that without this it would jump back and forth for ever.
     """
 
-    pressure: Float[Array, "points ny nx"]
-    clearance: Float[Array, "points ny nx"] | None
-    slope: Float[Array, "points ny nx"]
+    pressure: Float[Array, "points *faces"]
+    clearance: Float[Array, "points *faces"] | None
+    slope: Float[Array, "points *faces"]
     sticks: Array
     curvature: Array | float = 1.0
 
@@ -83,13 +83,13 @@ class PointContact(NamedTuple):
     """Contact at face points: tractions per current area [MPa], and the history after it."""
 
     traction: PointVector  # on the layer, pressure and friction
-    pressure: Float[Array, "points ny nx"]
-    clearance: Float[Array, "points ny nx"]
-    elastic: Float[Array, "2 points ny nx"]
-    slid: Float[Array, "2 points ny nx"]
-    friction: Float[Array, "2 points ny nx"]  # conjugate to slip in the surface's (x, y)
+    pressure: Float[Array, "points *faces"]
+    clearance: Float[Array, "points *faces"]
+    elastic: Float[Array, "2 points *faces"]
+    slid: Float[Array, "2 points *faces"]
+    friction: Float[Array, "2 points *faces"]  # conjugate to slip in the surface's (x, y)
     sliding: Array
-    guard: Float[Array, "3 3 points ny nx"]  # symmetric positive part of -d(traction)/dx
+    guard: Float[Array, "3 3 points *faces"]  # symmetric positive part of -d(traction)/dx
 
 
 class RigidSurface(eqx.Module):
@@ -114,23 +114,23 @@ class ImposedPressure(eqx.Module):
     """A dead pressure per reference area, applied elsewhere, that bounds friction here.
 
     Attributes:
-        start: Nodal pressure at load fraction 0 `(ny+1, nx+1)` [MPa].
+        start: Pressure at the corners of the faces at load fraction 0 `(4, *faces)` [MPa].
         end: The same at load fraction 1.
         area: Reference area per unit of (ξ, η) at the points [mm²].
     """
 
-    start: Float[Array, "my mx"]
-    end: Float[Array, "my mx"]
-    area: Float[Array, "points ny nx"]
+    start: Float[Array, "4 *faces"]
+    end: Float[Array, "4 *faces"]
+    area: Float[Array, "points *faces"]
 
-    def at_points(self, fraction: Array, rule: FaceRule) -> Float[Array, "points ny nx"]:
+    def at_points(self, fraction: Array, rule: FaceRule) -> Float[Array, "points *faces"]:
         """Interpolate the pressure [MPa] at the points; tension bounds friction by zero."""
-        nodal = (1.0 - fraction) * self.start + fraction * self.end
-        return jnp.maximum(contract(quadrature(rule).N, gather_face(nodal[None]))[:, 0], 0.0)
+        corners = (1.0 - fraction) * self.start + fraction * self.end
+        return jnp.maximum(contract(quadrature(rule).N, corners), 0.0)
 
 
 class ContactFace(eqx.Module):
-    """One face in contact with a rigid surface.
+    """Faces in contact with one rigid surface.
 
     Attributes:
         contact: Law and friction.
@@ -141,7 +141,7 @@ class ContactFace(eqx.Module):
         stiffness: Stiffness of an element per area [MPa/mm], the scale of hard contact.
         above: True for the sample, False for the window.
         rule: Where contact is integrated.
-        rolls: A side face, which the surface only pushes where it has turned towards it.
+        sides: Which faces are sides, pushed only where they have turned towards the surface; None: none.
     """
 
     contact: Contact
@@ -152,9 +152,9 @@ class ContactFace(eqx.Module):
     stiffness: Array
     above: bool = eqx.field(static=True)
     rule: FaceRule = eqx.field(static=True)
-    rolls: bool = eqx.field(static=True, default=False)
+    sides: Bool[Array, " *faces"] | None = None
 
-    def initial_history(self, x: Face) -> SlipHistory:
+    def initial_history(self, x: Corners) -> SlipHistory:
         """Build the history of a face that has not slipped."""
         position = surface_tangents(x, self.rule)[0][:2]
         zero = jnp.zeros_like(position)
@@ -175,7 +175,7 @@ class ContactFace(eqx.Module):
         friction = self._friction(pressure, position, history, slope_x, slope_y, None if law is None else law.sticks)
         push = 0.0 if self.imposed is not None else side * pressure
         traction = friction.traction - push * normal
-        eye = jnp.eye(3, dtype=position.dtype)[:, :, None, None, None]
+        eye = jnp.eye(3, dtype=position.dtype).reshape(3, 3, *[1] * pressure.ndim)
         along = normal[:, None] * normal[None]
         slid_along = friction.direction[:, None] * friction.direction[None]
         guard = stiffness * along + friction.stiffness * (eye - along - slid_along)
@@ -197,7 +197,7 @@ class ContactFace(eqx.Module):
         return ContactIterate(history.pressure, jnp.zeros_like(history.elastic))
 
     def tangent_law(
-        self, fraction: Array, x: Face, history: SlipHistory, iterate: ContactIterate, curvature: Array
+        self, fraction: Array, x: Corners, history: SlipHistory, iterate: ContactIterate, curvature: Array
     ) -> TangentLaw:
         """Linearise contact for the state x.
 
@@ -218,15 +218,15 @@ class ContactFace(eqx.Module):
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
 
     def follow(
-        self, fraction: Array, x: Face, change: Face, history: SlipHistory, law: TangentLaw, length: Array
+        self, fraction: Array, x: Corners, change: Corners, history: SlipHistory, law: TangentLaw, length: Array
     ) -> ContactIterate:
         """Compute what the next iteration remembers after a step of `length` along `change`.
 
         The pressure follows the clearance's linear change.
         """
 
-        def clearance(face):
-            return self.at_points(fraction, surface_tangents(face, self.rule)[0], history).clearance
+        def clearance(corners):
+            return self.at_points(fraction, surface_tangents(corners, self.rule)[0], history).clearance
 
         now, slope = jax.jvp(clearance, (x,), (change,))
         pressure = jnp.maximum(law.pressure + length * (law(now + slope) - law.pressure), 0.0)
@@ -259,56 +259,64 @@ class ContactFace(eqx.Module):
             sliding=closed & sliding,
         )
 
-    def _density(self, fraction: Array, y: Float[Array, "9 points ny nx"], history: SlipHistory, law) -> PointVector:
-        """Force on the layer per unit of (ξ, η): y stacks position and the two tangents."""
-        area = self._area(y) if law is None else _scaled_slope(self._area(y), law.curvature)
-        return self.at_points(fraction, y[:3], history, law).traction * area
-
-    def _area(self, y: Float[Array, "9 points ny nx"]) -> Float[Array, "points ny nx"]:
+    def _area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
+        """Compute the area per unit of (ξ, η) that the surface pushes on [mm²]."""
         if self.imposed is not None:
             return self.imposed.area
-        area = area_vector(y[3:6], y[6:])
-        return jnp.maximum(area[2] if self.above else -area[2], 0.0) if self.rolls else size(area)
+        area = area_vector(tangents[0], tangents[1])
+        if self.sides is None:
+            return size(area)
+        towards = jnp.maximum(area[2] if self.above else -area[2], 0.0)
+        return jnp.where(self.sides, towards, size(area))
 
-    def force(self, fraction: Array, x: Face, history: SlipHistory, law: TangentLaw | None = None) -> Face:
-        """Compute the nodal force on the layer [N]."""
-        y = jnp.concatenate(surface_tangents(x, self.rule))
-        return to_nodes(jnp.moveaxis(self._density(fraction, y, history, law), 1, 0), self.rule)
+    def force(self, fraction: Array, x: Corners, history: SlipHistory, law: TangentLaw | None = None) -> Corners:
+        """Compute the force on the layer at the corners of the faces [N]."""
+        position, *tangents = surface_tangents(x, self.rule)
+        area = self._area(jnp.stack(tangents))
+        area = area if law is None else _scaled_slope(area, law.curvature)
+        density = self.at_points(fraction, position, history, law).traction * area
+        return to_corners(jnp.moveaxis(density, 1, 0), self.rule)
 
     def stiffness_matrices(
-        self, fraction: Array, x: Face, history: SlipHistory, law: TangentLaw | None = None
+        self, fraction: Array, x: Corners, history: SlipHistory, law: TangentLaw | None = None
     ) -> tuple[Array, Array]:
-        """Compute -d(force)/dx of every face `(4 a, 4 b, 3, 3, ny, nx)` [N/mm].
+        """Compute -d(force)/dx of every face `(4 a, 4 b, 3, 3, *faces)` [N/mm].
 
         Returns:
             The exact matrix (not symmetric when points slide), and its symmetric positive part
             for the preconditioner: without curvature, area change and sliding's coupling.
         """
         q = quadrature(self.rule)
-        y = jnp.concatenate(surface_tangents(x, self.rule))
-        basis = jnp.broadcast_to(jnp.eye(9, dtype=y.dtype)[:, :, None, None, None], (9, *y.shape))
+        position, *tangents = surface_tangents(x, self.rule)
         at_law = None if law is None else law.at_its_pressure()
-        slopes = jax.vmap(lambda e: jax.jvp(lambda v: self._density(fraction, v, history, at_law), (y,), (e,))[1])(
-            basis
-        )
-        by_point = slopes.reshape(3, 3, *slopes.shape[1:])  # (N | dN_ξ | dN_η), j, i, points, ny, nx
-        by_point = jnp.transpose(by_point, (3, 0, 2, 1, 4, 5))
+
+        def traction(moved):
+            point = self.at_points(fraction, moved, history, at_law)
+            return point.traction, point
+
+        now, change, point = jax.linearize(traction, position, has_aux=True)
+        unit = jnp.eye(3, dtype=x.dtype).reshape(3, 3, *[1] * (position.ndim - 1))
+        by_position = jax.vmap(change)(jnp.broadcast_to(unit, (3, *position.shape)))  # j, i, points
+        area, pull_back = jax.vjp(self._area, jnp.stack(tangents))
+        (by_tangents,) = pull_back(jnp.broadcast_to(1.0 if law is None else law.curvature, area.shape))
+        slopes = jnp.concatenate([(by_position * area)[None], by_tangents[:, :, None] * now])
+        slopes = jnp.moveaxis(slopes, (3, 0, 2, 1), (0, 1, 2, 3))  # points, (N, dN_ξ, dN_η), i, j
         weights = q.N * q.weights[:, None]
-        tangents = np.concatenate([q.N[:, None], q.dN], axis=1)
-        pairs = np.einsum("qa,qmb->abqm", weights, tangents).reshape(4, 4, -1)
-        exact = -contract(pairs, by_point.reshape(-1, *by_point.shape[2:]))
-        point = self.at_points(fraction, y[:3], history, at_law)
-        guard = jnp.moveaxis(point.guard * self._area(y), 2, 0)
+        both = np.concatenate([q.N[:, None], q.dN], axis=1)
+        pairs = np.einsum("qa,qmb->abqm", weights, both).reshape(4, 4, -1)
+        exact = -contract(pairs, slopes.reshape(-1, *slopes.shape[2:]))
+        guard = jnp.moveaxis(point.guard * area, 2, 0)
         mass = np.einsum("qa,qb->abq", weights, q.N)
         return exact, contract(mass, guard)
 
-    def advance(self, fraction: Array, x: Face, history: SlipHistory) -> SlipHistory:
+    def advance(self, fraction: Array, x: Corners, history: SlipHistory) -> SlipHistory:
         """Compute the history at the end of an increment."""
-        y = jnp.concatenate(surface_tangents(x, self.rule))
-        point = self.at_points(fraction, y[:3], history)
-        weights = quadrature(self.rule).weights[:, None, None]
-        work = jnp.sum(weights * self._area(y) * jnp.sum(point.friction * point.slid, axis=0))
-        return SlipHistory(y[:2], point.elastic, history.slip + point.slid, history.dissipated - work, point.pressure)
+        position, *tangents = surface_tangents(x, self.rule)
+        point = self.at_points(fraction, position, history)
+        weights = quadrature(self.rule).weights
+        work = self._area(jnp.stack(tangents)) * jnp.sum(point.friction * point.slid, axis=0)
+        dissipated = history.dissipated - jnp.sum(jnp.tensordot(weights, work, 1))
+        return SlipHistory(position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
 
 
 class _Friction(NamedTuple):

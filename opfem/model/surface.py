@@ -35,18 +35,14 @@ class HeightField(eqx.Module):
         my, mx = self.coefficients.shape
         i, tx, inside_x = _locate((x - self.origin[0]) / self.spacing[0], mx)
         j, ty, inside_y = _locate((y - self.origin[1]) / self.spacing[1], my)
-        wx, dx = _WEIGHTS[self.interpolation](tx)
-        wy, dy = _WEIGHTS[self.interpolation](ty)
-        height = slope_x = slope_y = jnp.zeros_like(tx)
-        for b in range(4):
-            row = jnp.clip(j + b - 1, 0, my - 1)
-            values = [self.coefficients[row, jnp.clip(i + a - 1, 0, mx - 1)] for a in range(4)]
-            along = sum(w * v for w, v in zip(wx, values, strict=True))
-            height = height + wy[b] * along
-            slope_x = slope_x + wy[b] * sum(d * v for d, v in zip(dx, values, strict=True))
-            slope_y = slope_y + dy[b] * along
-        slope_x = jnp.where(inside_x, slope_x / self.spacing[0], 0.0)
-        return height, slope_x, jnp.where(inside_y, slope_y / self.spacing[1], 0.0)
+        around = np.arange(-1, 3).reshape(4, *[1] * tx.ndim)
+        rows, columns = jnp.clip(j + around, 0, my - 1), jnp.clip(i + around, 0, mx - 1)
+        values = self.coefficients[rows[:, None], columns]
+        (wx, dx), (wy, dy) = (_weights(self.interpolation, t) for t in (tx, ty))
+        along = jnp.sum(wx * values, axis=1)
+        slope_x = jnp.sum(wy * jnp.sum(dx * values, axis=1), axis=0) / self.spacing[0]
+        slope_y = jnp.sum(dy * along, axis=0) / self.spacing[1]
+        return jnp.sum(wy * along, axis=0), jnp.where(inside_x, slope_x, 0.0), jnp.where(inside_y, slope_y, 0.0)
 
 
 def height_field(values: Float[Array, "my mx"], origin, spacing, interpolation: Interpolation) -> HeightField:
@@ -79,32 +75,17 @@ def _spline_prefilter(n: int) -> np.ndarray:
     return np.linalg.inv(rows / 6)
 
 
-def _b_spline(t):
-    u = 1.0 - t
-    weights = (u**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * u**2 + 3 * u**3) / 6, t**3 / 6)
-    slopes = (-(u**2) / 2, (-4 * t + 3 * t**2) / 2, (4 * u - 3 * u**2) / 2, t**2 / 2)
-    return weights, slopes
+def _weights(interpolation: str, t: Array) -> tuple[Array, Array]:
+    """Weights of the four nodes around a point and their slopes `(4, …)`, at t in the cell [0, 1]."""
+    cubics = jnp.asarray(_CUBICS[interpolation], t.dtype)
+    powers = jnp.stack([jnp.ones_like(t), t, t**2, t**3])
+    slopes = jnp.stack([jnp.ones_like(t), 2 * t, 3 * t**2])
+    return jnp.tensordot(cubics, powers, 1), jnp.tensordot(cubics[:, 1:], slopes, 1)
 
 
-def _catmull_rom(t):
-    weights = (
-        (-t + 2 * t**2 - t**3) / 2,
-        (2 - 5 * t**2 + 3 * t**3) / 2,
-        (t + 4 * t**2 - 3 * t**3) / 2,
-        (-(t**2) + t**3) / 2,
-    )
-    slopes = (
-        (-1 + 4 * t - 3 * t**2) / 2,
-        (-10 * t + 9 * t**2) / 2,
-        (1 + 8 * t - 9 * t**2) / 2,
-        (-2 * t + 3 * t**2) / 2,
-    )
-    return weights, slopes
-
-
-def _bilinear(t):
-    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
-    return (zero, 1.0 - t, t, zero), (zero, -one, one, zero)
-
-
-_WEIGHTS = {"cubic": _b_spline, "catmull-rom": _catmull_rom, "bilinear": _bilinear}
+# Coefficients of 1, t, t², t³ in the weight of each of the four nodes.
+_CUBICS = {
+    "cubic": np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6,
+    "catmull-rom": np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]) / 2,
+    "bilinear": np.array([[0, 0, 0, 0], [1, -1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], float),
+}

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._checks import concrete
-from ..mechanics.boundary import Parts
-from ..mechanics.face import FaceRule, area_vector, size, surface_tangents, tributary_area
+from ..mechanics.boundary import Bodies, is_side, take
+from ..mechanics.face import FaceRule, area_vector, gather_face, size, surface_tangents, tributary_area
 from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
 from ..mechanics.internal import layer_body
 from ..model import (
@@ -49,10 +49,11 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
             contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
         )
 
-    def sides(face: ContactFace | None) -> ContactFace | None:
+    def with_sides(face: ContactFace | None) -> ContactFace | None:
         if face is None or face.imposed is not None or palpation.sides == ("roller",) * 4:
-            return None
-        return dataclasses.replace(face, rolls=True)
+            return face
+        nx, ny, nz = mesh.elements
+        return dataclasses.replace(face, sides=jnp.asarray(is_side((nz, ny, nx))))
 
     plane = RigidSurface(None, None)
     window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
@@ -65,8 +66,9 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
         if load.lateral is None:
-            _, xi, eta = surface_tangents(X[:, -1], "nodes")
-            pressure = ImposedPressure(-first[2], -last[2], size(area_vector(xi, eta)))
+            _, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
+            start_normal, end_normal = (gather_face(-end[2:]).reshape(4, -1) for end in (first, last))
+            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)))
             sample = face(palpation.sample, plane, True, imposed=pressure, rule="nodes")
     else:
         first, last = (_displacement(end if isinstance(end, Displacement) else None, mesh) for end in (start, load))
@@ -76,7 +78,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         share = tributary_area(X[:, 0])
         spring = palpation.hold * share / jnp.sum(share)
     body = layer_body(mesh, material, palpation.element)
-    contacts = Parts(window, sample, sides(window), sides(sample))
+    contacts = Bodies(with_sides(window), with_sides(sample))
     return Problem(body, X, contacts, dead, imposed, spring, jnp.zeros((), X.dtype), _supports(palpation, load))
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.boundary import Parts, add_matrices, put, take
+from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, put, take, to_touching
 from ..mechanics.face import tributary_area
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
@@ -57,24 +57,21 @@ class State(eqx.Module):
     Attributes:
         u: Displacement [mm].
         fraction: Load fraction [-].
-        histories: Friction history (`SlipHistory`) of every part of the boundary in contact.
+        histories: Friction history (`SlipHistory`) of the contact with each body.
         held: Whether the in-plane hold carries rigid motion.
     """
 
     u: Nodal
     fraction: Float[Array, ""]
-    histories: Parts
+    histories: Bodies
     held: Array
 
 
 class Forces(NamedTuple):
-    """Nodal forces on the layer [N] at one state, and the smallest volume ratio.
-
-    `applied` has every part of the boundary: window and sample always, sides where they may touch.
-    """
+    """Nodal forces on the layer [N] at one state, those of each body, and the smallest volume ratio."""
 
     internal: Nodal
-    applied: Parts
+    applied: Bodies  # of Touching
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
 
@@ -84,12 +81,18 @@ class Problem(eqx.Module):
 
     body: LayerBody
     positions: Nodal
-    contacts: Parts  # of ContactFace
+    contacts: Bodies  # of ContactFace
     dead: tuple[Array, Array] | None  # nodal force at the interface [N], at fraction 0 and 1
     imposed: tuple[Array, Array] | None  # u_z at the interface [mm], at fraction 0 and 1
     spring: Array | None  # in-plane stiffness under each node of the window face [N/mm]
     viscosity: Array  # of the medium that slows the layer on its way through a snap [-], else 0
     supports: Supports = eqx.field(static=True)
+
+    @property
+    def elements(self) -> tuple[int, int, int]:
+        """Elements (nz, ny, nx)."""
+        nz, ny, nx = (n - 1 for n in self.positions.shape[1:])
+        return nz, ny, nx
 
     @property
     def free(self) -> np.ndarray:
@@ -101,45 +104,51 @@ class Problem(eqx.Module):
         internal, smallest_J = self.body.internal_force(u)
         internal = internal + self._drag(self.viscosity) * _node_share(u.shape[1:]) * (u - state.u)
         spring = None if self.spring is None else -self.spring * u[:2, 0]
-        return self.with_contact(Forces(internal, Parts(), spring, smallest_J), u, fraction, state)
+        return self.with_contact(Forces(internal, Bodies(), spring, smallest_J), u, fraction, state)
 
     def with_contact(
-        self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Parts | None = None
+        self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Bodies | None = None
     ) -> Forces:
         """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
-        x = self.positions + u
         applied = self.contacts.map(
-            lambda place, face, history, law: face.force(fraction, take(x, place), history, law),
+            lambda body, face, history, law: to_touching(
+                face.force(fraction, self._corners(u, body), history, law), self.elements
+            ),
             state.histories,
-            laws or Parts(),
+            laws or Bodies(),
         )
-        zero = jnp.zeros_like(u[:, 0])
-        window, sample = (zero if force is None else force for force in (applied.window, applied.sample))
+        none = Touching(jnp.zeros_like(u[:, 0]), None)
+        window, sample = (none if touching is None else touching for touching in applied)
         if self.dead is not None:
-            sample = sample + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1]
-        return forces._replace(applied=applied._replace(window=window, sample=sample))
+            sample = sample._replace(face=sample.face + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1])
+        return forces._replace(applied=Bodies(window, sample))
 
-    def tangent_laws(self, u: Nodal, fraction: Array, state: State, iterates: Parts, curvature: Array) -> Parts:
+    def _corners(self, u: Nodal, body: Body) -> Corners:
+        """Take the corner positions [mm] of all faces that may touch a body."""
+        return self._take(self.positions + u, body)
+
+    def _take(self, values: Nodal, body: Body) -> Corners:
+        return take(values, body, with_sides=getattr(self.contacts, body).sides is not None)
+
+    def tangent_laws(self, u: Nodal, fraction: Array, state: State, iterates: Bodies, curvature: Array) -> Bodies:
         """Linearise contact (`TangentLaw`)."""
-        x = self.positions + u
         return self.contacts.map(
-            lambda place, face, history, it: face.tangent_law(fraction, take(x, place), history, it, curvature),
+            lambda body, face, history, it: face.tangent_law(fraction, self._corners(u, body), history, it, curvature),
             state.histories,
             iterates,
         )
 
-    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Parts, length: Array) -> Parts:
+    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Bodies, length: Array) -> Bodies:
         """Compute what the next iteration remembers (`ContactIterate`) after a step of `length` along `change`."""
-        x = self.positions + u
         return self.contacts.map(
-            lambda place, face, history, law: face.follow(
-                fraction, take(x, place), take(change, place), history, law, length
+            lambda body, face, history, law: face.follow(
+                fraction, self._corners(u, body), self._take(change, body), history, law, length
             ),
             state.histories,
             laws,
         )
 
-    def initial_iterates(self, state: State) -> Parts:
+    def initial_iterates(self, state: State) -> Bodies:
         """Start the iteration from the contact of a converged state."""
         return self.contacts.map(lambda _, face, history: face.initial_iterate(history), state.histories)
 
@@ -156,21 +165,18 @@ class Problem(eqx.Module):
         top, bottom = (
             np.array(prescribed[kind])[:, None, None] for kind in (self.supports.interface, self.supports.window)
         )
-        applied = forces.applied
-        return forces._replace(
-            applied=applied._replace(
-                sample=applied.sample + top * unbalanced[:, -1], window=applied.window + bottom * unbalanced[:, 0]
-            )
-        )
+        window, sample = forces.applied
+        window = window._replace(face=window.face + bottom * unbalanced[:, 0])
+        sample = sample._replace(face=sample.face + top * unbalanced[:, -1])
+        return forces._replace(applied=Bodies(window, sample))
 
     def _unbalanced(self, forces: Forces) -> Nodal:
         unbalanced = forces.internal
-        for place, force in zip(Parts._fields, forces.applied, strict=True):
-            if force is not None:
-                unbalanced = unbalanced - put(force, place, unbalanced.shape)
+        for body, touching in zip(Bodies._fields, forces.applied, strict=True):
+            unbalanced = unbalanced - put(touching, body, unbalanced.shape)
         if forces.spring is not None:
             spring = jnp.concatenate([forces.spring, jnp.zeros_like(forces.spring[:1])])
-            unbalanced = unbalanced - put(spring, "window", unbalanced.shape)
+            unbalanced = unbalanced - put(Touching(spring, None), "window", unbalanced.shape)
         return unbalanced
 
     def residual(self, forces: Forces, held: Array) -> Nodal:
@@ -180,15 +186,15 @@ class Problem(eqx.Module):
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
         applied = self.reactions(forces).applied
-        contact = jnp.sum(applied.sample**2) + jnp.sum(applied.window**2)
+        contact = jnp.sum(applied.sample.face**2) + jnp.sum(applied.window.face**2)
         hx, hy = self.body.geometry.spacing
         nodes = self.positions[0, 0].size
         # Below a thousandth of the shear modulus on the whole field, forces count as none.
         floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(contact + floor**2)
 
-    def drift_modes(self) -> list[Float[Array, "2 my mx"]]:
-        """Build orthonormal rigid motions of the window face that no support prevents.
+    def drift_modes(self) -> Float[Array, "modes 2 my mx"] | None:
+        """Build orthonormal rigid motions of the window face that no support prevents; None without any.
 
         Weighted by area: what they measure is the mean in-plane motion of the face.
         """
@@ -203,13 +209,18 @@ class Problem(eqx.Module):
                 for other in modes:
                     mode = mode - jnp.sum(mode * other) * other
                 modes.append(mode / jnp.sqrt(jnp.sum(mode**2)))
-        return modes
+        return jnp.stack(modes) if modes else None
+
+    def _rigid_part(self, face: Float[Array, "2 my mx"]) -> Float[Array, "2 my mx"]:
+        """Compute the part of in-plane nodal values at the window that moves the layer as a whole."""
+        modes = self.drift_modes()
+        if modes is None:
+            return jnp.zeros_like(face)
+        return jnp.tensordot(jnp.tensordot(modes, face, 3), modes, 1)
 
     def project(self, r: Nodal, held: Array) -> Nodal:
         """Take the held rigid motions out of a nodal field."""
-        face = r[:2, 0]
-        for mode in self.drift_modes():
-            face = face - jnp.where(held, jnp.sum(mode * face), 0.0) * mode
+        face = r[:2, 0] - jnp.where(held, self._rigid_part(r[:2, 0]), 0.0)
         bottom = jnp.concatenate([face, r[2:, 0]])
         return jnp.concatenate([bottom[:, None], r[:, 1:]], axis=1)
 
@@ -217,13 +228,9 @@ class Problem(eqx.Module):
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
         if forces.spring is not None:
             return forces.spring
-        unbalanced = (self.free * self._unbalanced(forces))[:2, 0]
-        modes = self.drift_modes()
-        if not modes:
-            return jnp.zeros_like(unbalanced)
-        return jnp.sum(jnp.stack([jnp.where(held, jnp.sum(mode * unbalanced), 0.0) * mode for mode in modes]), axis=0)
+        return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self._unbalanced(forces))[:2, 0]), 0.0)
 
-    def tangent(self, u: Nodal, fraction: Array, state: State, laws: Parts) -> tuple[Stencil, Array, Array]:
+    def tangent(self, u: Nodal, fraction: Array, state: State, laws: Bodies) -> tuple[Stencil, Array, Array]:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
         Returns:
@@ -233,16 +240,15 @@ class Problem(eqx.Module):
         K = _single(self.body).stiffness(_single(u))
         K = K + _single(self._drag(self.viscosity)) * _LUMPED
         guarded = K
-        x = self.positions + u
         matrices = self.contacts.map(
-            lambda place, face, history, law: face.stiffness_matrices(fraction, take(x, place), history, law),
+            lambda body, face, history, law: face.stiffness_matrices(fraction, self._corners(u, body), history, law),
             state.histories,
             laws,
         )
-        for place, both in zip(Parts._fields, matrices, strict=True):
+        for body, both in zip(Bodies._fields, matrices, strict=True):
             if both is not None:
-                K = add_matrices(K, _single(both[0]), place)
-                guarded = add_matrices(guarded, _single(both[1]), place)
+                K = add_matrices(K, _single(both[0]), body)
+                guarded = add_matrices(guarded, _single(both[1]), body)
         hx, hy = self.body.geometry.spacing
         depth = jnp.mean(self.body.geometry.depth)
         scale = self.body.material.shear * hx * hy / depth
@@ -262,18 +268,17 @@ class Problem(eqx.Module):
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
         return viscosity * self.body.material.shear * jnp.mean(self.body.geometry.depth)
 
-    def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 ny nx"]:
+    def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 faces"]:
         """Spread an in-plane stiffness [N/mm] evenly over the faces at the window, lumped at nodes."""
-        ny, nx = (n - 1 for n in self.positions.shape[2:])
+        _, ny, nx = self.elements
         lumped = np.eye(4)[:, :, None, None] * np.diag([1.0, 1.0, 0.0])
-        each = stiffness / (4.0 * nx * ny) * lumped[..., None, None]
-        return jnp.broadcast_to(each, (4, 4, 3, 3, ny, nx))
+        each = stiffness / (4.0 * nx * ny) * lumped[..., None]
+        return jnp.broadcast_to(each, (4, 4, 3, 3, ny * nx))
 
     def advance(self, u: Nodal, fraction: Array, state: State, held: Array) -> State:
         """Build the state at the end of an increment, friction history included."""
-        x = self.positions + u
         histories = self.contacts.map(
-            lambda place, face, history: face.advance(fraction, take(x, place), history), state.histories
+            lambda body, face, history: face.advance(fraction, self._corners(u, body), history), state.histories
         )
         return State(u, jnp.asarray(fraction, u.dtype), histories, held)
 
@@ -288,7 +293,7 @@ class Problem(eqx.Module):
 
     def initial_state(self) -> State:
         """Build the undeformed state at load fraction zero."""
-        histories = self.contacts.map(lambda place, face: face.initial_history(take(self.positions, place)))
+        histories = self.contacts.map(lambda body, face: face.initial_history(self._take(self.positions, body)))
         u = jnp.zeros_like(self.positions)
         return State(u, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import check_positive
-from ..mechanics.boundary import Parts
+from ..mechanics.boundary import Bodies
 from ..mechanics.face import FaceRule
 from .equilibrium import Forces, Problem, State
 from .krylov import fgmres
@@ -23,6 +23,8 @@ from .stencil import Nodal, apply_stencil
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
 _SETTLED = 0.3
+# An increment is cut after this many steps in a row that end above; on the coin, those that converge have at most six.
+_MOST_UNSETTLED = 10
 # Directions GMRES keeps before it restarts.
 _KRYLOV_BASIS = 30
 # An increment is cut when this many of its linear systems could not be solved.
@@ -92,18 +94,19 @@ class IncrementResult(NamedTuple):
     steps: Array
     krylov: Array
     residual: Array  # relative to the force scale
-    smallest_J: Array
+    forces: Forces
 
 
 class _Iterate(NamedTuple):
     u: Nodal
-    contact: Parts  # of ContactIterate
+    contact: Bodies  # of ContactIterate
     forces: Forces
     size: Array
     tolerance: Array
     steps: Array
     krylov: Array
     unsolved: Array  # linear solves that ended at krylov_steps
+    unsettled: Array  # steps in a row that ended far from equilibrium
 
 
 def solve_increment(
@@ -118,11 +121,14 @@ def solve_increment(
         return forces, size, settings.rtol * problem.force_scale(forces)
 
     def unfinished(it):
-        goes_on = (it.steps < settings.max_steps) & jnp.isfinite(it.size) & (it.unsolved < _MOST_UNSOLVED)
-        return (it.size > it.tolerance) & goes_on
+        hopeless = (it.unsolved >= _MOST_UNSOLVED) | (it.unsettled >= _MOST_UNSETTLED)
+        return (it.size > it.tolerance) & (it.steps < settings.max_steps) & jnp.isfinite(it.size) & ~hopeless
+
+    def is_settled(size, tolerance):
+        return size < _SETTLED / settings.rtol * tolerance
 
     def step(it):
-        settled = (it.size < _SETTLED / settings.rtol * it.tolerance) | (it.steps == 0)
+        settled = is_settled(it.size, it.tolerance) | (it.steps == 0)
         laws = problem.tangent_laws(it.u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
         S, guarded, scale = problem.tangent(it.u, fraction, state, laws)
         free = problem.free
@@ -157,11 +163,12 @@ def solve_increment(
             steps=it.steps + 1,
             krylov=it.krylov + solution.iterations,
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),
+            unsettled=jnp.where(is_settled(size, tolerance), 0, it.unsettled + 1),
         )
 
     u = problem.with_imposed(guess, fraction)
     zero = jnp.zeros((), int)
-    first = _Iterate(u, problem.initial_iterates(state), *evaluate(u), zero, zero, zero)
+    first = _Iterate(u, problem.initial_iterates(state), *evaluate(u), zero, zero, zero, zero)
     end = jax.lax.while_loop(unfinished, step, first)
     return IncrementResult(
         state=problem.advance(end.u, fraction, state, held),
@@ -169,7 +176,7 @@ def solve_increment(
         steps=end.steps,
         krylov=end.krylov,
         residual=end.size / end.tolerance * settings.rtol,
-        smallest_J=end.forces.smallest_J,
+        forces=end.forces,
     )
 
 

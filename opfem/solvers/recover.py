@@ -6,13 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
-from ..mechanics.boundary import Place, take
+from ..mechanics.boundary import Body, take, to_touching
 from ..mechanics.face import (
     area_vector,
     nodal_area_vector,
     size,
     surface_tangents,
-    to_nodes,
+    to_corners,
     tributary_area,
 )
 from ..model import Imprint, Load
@@ -41,12 +41,12 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     hold = problem.hold_force(forces, state.held)
     stress = problem.body.cauchy(u)[2, 2]
     applied = forces.applied
-    sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample)
-    window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window)
+    sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample.face)
+    window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window.face)
     dissipated = [history.dissipated for history in state.histories if history is not None]
     stats = {
-        "force_sample": _total(applied.sample) + _total(applied.sample_sides),
-        "force_window": _total(applied.window) + _total(applied.window_sides),
+        "force_sample": applied.sample.total,
+        "force_window": applied.window.total,
         "force_hold": jnp.concatenate([jnp.sum(hold, axis=(1, 2)), jnp.zeros(1, u.dtype)]),
         "strain_energy": problem.body.energy(u),
         "friction_dissipation": sum(dissipated, start=jnp.zeros((), u.dtype)),
@@ -60,18 +60,15 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     return Fields(sample, window, _thickness(problem, u, load), mean, stats)
 
 
-def _total(force: Array | None) -> Array | float:
-    return 0.0 if force is None else jnp.sum(force, axis=(1, 2))
-
-
 def _face(
-    problem: Problem, place: Place, support: str, before: State, state: State, force: Array
+    problem: Problem, body: Body, support: str, before: State, state: State, force: Array
 ) -> tuple[FaceResult, dict[str, Array]]:
-    face, old, new = (getattr(parts, place) for parts in (problem.contacts, before.histories, state.histories))
-    X, u = take(problem.positions, place), take(state.u, place)
+    face, old, new = (getattr(bodies, body) for bodies in (problem.contacts, before.histories, state.histories))
+    level = 0 if body == "window" else -1
+    X, u = problem.positions[:, level], state.u[:, level]
     x = X + u
     area = nodal_area_vector(x)
-    outward = area if place == "sample" else -area
+    outward = area if body == "sample" else -area
     pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
     traction = force / tributary_area(X)
     zero = jnp.zeros((), x.dtype)
@@ -80,13 +77,19 @@ def _face(
         status = jnp.full(pressure.shape, STICK if sticks else SLIP)
         slip = jnp.zeros_like(x[:2]) if sticks else u[:2]
         return FaceResult(pressure, traction, slip, status), {"approach": zero, "max_penetration": zero}
-    position, xi, eta = surface_tangents(x, face.rule)
+    corners = take(problem.positions + state.u, body, with_sides=False)
+    old, new = (jax.tree.map(lambda v: v[..., : corners.shape[-1]] if v.ndim else v, history) for history in (old, new))
+    position, xi, eta = surface_tangents(corners, face.rule)
+
+    def on_nodes(values):
+        return to_touching(to_corners(values, face.rule), problem.elements).face
+
     point = face.at_points(state.fraction, position, old)
     weight = size(area_vector(xi, eta))
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
-    share = to_nodes(jnp.stack([weight, load, load * point.sliding], axis=1), face.rule)
+    share = on_nodes(jnp.stack([weight, load, load * point.sliding], axis=1))
     status = jnp.where(share[1] > 0, jnp.where(share[2] > 0.5 * share[1], SLIP, STICK), OPEN)
-    slip = to_nodes(jnp.moveaxis(new.slip * weight, 1, 0), face.rule) / share[0]
+    slip = on_nodes(jnp.moveaxis(new.slip * weight, 1, 0)) / share[0]
     total = jnp.sum(load)
     towards = face.contact.law.zero_pressure_clearance - point.clearance
     imposed = face.imposed is not None

@@ -93,12 +93,7 @@ def _correct_approach(
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
         offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
-        on_sample = [face for face in (problem.contacts.sample, problem.contacts.sample_sides) if face is not None]
-        shifted = eqx.tree_at(
-            lambda p: [face.offset for face in (p.contacts.sample, p.contacts.sample_sides) if face is not None],
-            problem,
-            [offset] * len(on_sample),
-        )
+        shifted = eqx.tree_at(lambda p: p.contacts.sample.offset, problem, offset)
         # The surface is in place; what is left is one increment at the full load.
         again = begin(stepping.state, solver)
         state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .equilibrium import Problem, State
+from .equilibrium import Forces, Problem, State
 from .newton import Newton, solve_increment
 from .solution import RESULTS
 
@@ -151,7 +151,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
 
     state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
     origin = _where(goes_on, _where(ok, result.state, s.origin), state)
-    can_release, slides = _hold_balance(problem, s.origin, result.state)
+    can_release, slides = _hold_balance(problem, result.forces, result.state)
     attempts = s.attempts + 1
     return Stepping(
         state=state,
@@ -191,9 +191,9 @@ def _where(condition: Array, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _hold_balance(problem: Problem, before: State, state: State) -> tuple[Array, Array]:
+def _hold_balance(problem: Problem, forces: Forces, state: State) -> tuple[Array, Array]:
     """Compare what the hold carries with what friction could, and with the normal force."""
-    forces = problem.reactions(problem.forces(state.u, state.fraction, before))
+    forces = problem.reactions(forces)
     hold = problem.hold_force(forces, state.held)
     X = problem.positions[:2, 0]
     arm = X - jnp.mean(X, axis=(1, 2), keepdims=True)
@@ -202,10 +202,10 @@ def _hold_balance(problem: Problem, before: State, state: State) -> tuple[Array,
     moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
     carried = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
     capacity = jnp.zeros((), carried.dtype)
-    for face, force in zip(problem.contacts, forces.applied, strict=True):
+    for face, touching in zip(problem.contacts, forces.applied, strict=True):
         if face is not None:
-            capacity = capacity + face.contact.friction * jnp.abs(jnp.sum(force[2]))
-    normal = jnp.abs(jnp.sum(forces.applied.sample[2]))
+            capacity = capacity + face.contact.friction * jnp.abs(touching.total[2])
+    normal = jnp.abs(forces.applied.sample.total[2])
     return (capacity > 0) & (carried <= _RELEASE_MARGIN * capacity), carried > _BALANCED * normal
 
 

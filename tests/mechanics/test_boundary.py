@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.mechanics.boundary import Parts, add_matrices, put, take
-from opfem.mechanics.face import area_vector, assemble_face, gather_face, surface_tangents
+from opfem.mechanics.boundary import Bodies, Touching, add_matrices, is_side, put, take, to_touching
+from opfem.mechanics.face import area_vector, gather_face, surface_tangents
 from opfem.mechanics.interaction import ContactFace, RigidSurface
 from tests.oracles import assemble_dense
 from tests.tolerances import ROUNDOFF
 
 NX, NY = 5, 3
-PLACES = pytest.mark.parametrize("place", Parts._fields)
+BODIES = pytest.mark.parametrize("body", Bodies._fields)
+SIDES = pytest.mark.parametrize("with_sides", [True, False], ids=["with sides", "face only"])
 LAYERS = pytest.mark.parametrize("nz", [1, 2, 3])
 
 
@@ -25,59 +26,74 @@ def brick(nz, height=0.4):
     return np.stack([x, y, z])
 
 
+@LAYERS
+@BODIES
+def test_the_face_comes_first_then_the_sides(nz, body):
+    u = nodal(nz)
+    corners = take(jnp.array(u), body, with_sides=True)
+    own = gather_face(jnp.array(u[:, 0 if body == "window" else -1])).reshape(4, 3, -1)
+    np.testing.assert_array_equal(corners[..., ~is_side((nz, NY, NX))], own)
+    np.testing.assert_array_equal(take(jnp.array(u), body, with_sides=False), own)
+    assert is_side((nz, NY, NX)).sum() == (nz + 1) // 2 * 2 * (NX + NY)
+
+
 @pytest.mark.parametrize(("nz", "low", "high"), [(1, (0, 1), (0, 1)), (2, (0, 1), (1, 2)), (3, (0, 2), (1, 3))])
 def test_window_has_the_lower_half_of_the_sides_and_sample_the_upper(nz, low, high):
     X = jnp.array(brick(nz, height=float(nz)))
-    for place, (first, last) in (("window_sides", low), ("sample_sides", high)):
-        assert (float(take(X, place)[2].min()), float(take(X, place)[2].max())) == (first, last)
+    for body, (first, last) in (("window", low), ("sample", high)):
+        z = take(X, body, with_sides=True)[:, 2, is_side((nz, NY, NX))]
+        assert (float(z.min()), float(z.max())) == (first, last)
 
 
 @LAYERS
-def test_sides_run_once_around_the_layer_and_face_outward(nz):
-    X = brick(nz)
-    strip = take(jnp.array(X), "window_sides")
-    np.testing.assert_array_equal(strip[..., 0], strip[..., -1])
-    corners = {(0.0, 0.0), (1.5, 0.0), (1.5, 0.9), (0.0, 0.9)}
-    assert corners <= {tuple(np.round(p, 12)) for p in np.asarray(strip[:2, 0]).T}
-    assert strip.shape[-1] == 2 * (NX + NY) + 1
-    position, xi, eta = surface_tangents(strip, "gauss2")
+@BODIES
+def test_sides_run_once_around_the_layer_and_face_outward(nz, body):
+    corners = take(jnp.array(brick(nz)), body, with_sides=True)[..., is_side((nz, NY, NX))]
+    position, xi, eta = surface_tangents(corners, "gauss2")
     area = np.asarray(area_vector(xi, eta))
-    outward = np.asarray(position[:2]) - np.array([0.75, 0.45])[:, None, None, None]
+    outward = np.asarray(position[:2]) - np.array([0.75, 0.45])[:, None, None]
     assert np.all(np.sum(area[:2] * outward, axis=0) > 0)
     np.testing.assert_allclose(area[2], 0.0, atol=ROUNDOFF)
-
-
-@PLACES
-@LAYERS
-def test_put_is_the_transpose_of_take(nz, place):
-    u = nodal(nz)
-    taken = np.asarray(take(jnp.array(u), place))
-    f = np.random.default_rng(1).standard_normal(taken.shape)
+    height = 0.4 * ((nz + 1) // 2) / nz
     np.testing.assert_allclose(
-        np.sum(taken * f), np.sum(u * np.asarray(put(jnp.array(f), place, u.shape))), 100 * ROUNDOFF
+        np.abs(area).mean(axis=1).sum(axis=1), [2 * 0.9 * height, 2 * 1.5 * height, 0], ROUNDOFF, ROUNDOFF
     )
 
 
-@PLACES
+@BODIES
 @LAYERS
-def test_matrices_act_on_the_nodes_of_their_part(nz, place):
+@SIDES
+def test_corner_values_return_to_the_nodes_they_came_from(nz, body, with_sides):
+    """Taking is a linear map; adding corners into nodes and putting these into the layer is its transpose."""
     u = nodal(nz)
-    part = take(jnp.array(u), place)
-    rows, columns = part.shape[1] - 1, part.shape[2] - 1
-    M = np.random.default_rng(2).standard_normal((4, 4, 3, 3, rows, columns))
-    K = add_matrices(jnp.zeros((nz, 8, 8, 3, 3, NY, NX)), jnp.array(M), place)
+    taken = np.asarray(take(jnp.array(u), body, with_sides))
+    f = np.random.default_rng(1).standard_normal(taken.shape)
+    touching = to_touching(jnp.array(f), (nz, NY, NX))
+    assert isinstance(touching, Touching)
+    np.testing.assert_allclose(touching.total, f.sum(axis=(0, 2)), 100 * ROUNDOFF)
+    back = np.asarray(put(touching, body, u.shape))
+    np.testing.assert_allclose(np.sum(taken * f), np.sum(u * back), 100 * ROUNDOFF)
+
+
+@BODIES
+@LAYERS
+@SIDES
+def test_matrices_act_on_the_nodes_of_their_faces(nz, body, with_sides):
+    u = nodal(nz)
+    corners = take(jnp.array(u), body, with_sides)
+    M = np.random.default_rng(2).standard_normal((4, 4, 3, 3, corners.shape[-1]))
+    K = add_matrices(jnp.zeros((nz, 8, 8, 3, 3, NY, NX)), jnp.array(M), body)
     product = (assemble_dense(np.asarray(K)) @ u.ravel()).reshape(u.shape)
-    on_faces = jnp.einsum("abijyx,bjyx->aiyx", M, gather_face(part))
-    np.testing.assert_allclose(product, put(assemble_face(on_faces), place, u.shape), 10 * ROUNDOFF, 100 * ROUNDOFF)
+    on_faces = to_touching(jnp.einsum("abijf,bjf->aif", M, corners), (nz, NY, NX))
+    np.testing.assert_allclose(product, put(on_faces, body, u.shape), 10 * ROUNDOFF, 100 * ROUNDOFF)
 
 
 def side_face(above):
     contact = op.Contact(op.LinearOverclosure(7.0), friction=0.0)
     numbers = (jnp.asarray(v, float) for v in (0.0, 0.3, 0.5))
     offset, element_size, stiffness = numbers
-    return ContactFace(
-        contact, RigidSurface(None, None), offset, None, element_size, stiffness, above, "gauss2", rolls=True
-    )
+    sides = jnp.array([True])
+    return ContactFace(contact, RigidSurface(None, None), offset, None, element_size, stiffness, above, "gauss2", sides)
 
 
 @pytest.mark.parametrize("above", [True, False], ids=["sample", "window"])
@@ -90,7 +106,8 @@ def test_a_side_feels_only_the_surface_that_it_has_turned_towards(above):
         # Seen from outside (south), x runs right and z up; lean moves the far edge outward, along -y.
         y = -lean * (1 - z / 0.001 if above else z / 0.001)
         strip = jnp.array(np.stack([x, y, z + sign * (overclosure if above else overclosure + 0.001)]))
+        strip = gather_face(strip).reshape(4, 3, 1)
         face = side_face(above)
-        force = np.asarray(face.force(jnp.ones(()), strip, face.initial_history(strip))).sum(axis=(1, 2))
+        force = np.asarray(face.force(jnp.ones(()), strip, face.initial_history(strip))).sum(axis=(0, 2))
         depth = overclosure + 0.0005
         np.testing.assert_allclose(force, [0, 0, -sign * 7.0 * depth * max(lean, 0.0)], 1e-9, ROUNDOFF)

@@ -63,7 +63,7 @@ def test_rule_integrates_polynomials_of_its_degree(rule, degree):
 @RULES
 def test_area_of_a_stretched_and_tilted_face(rule):
     face = flat(stretch=(1.3, 0.9), slope=(0.4, -0.2))
-    _, xi, eta = surface_tangents(face, rule)
+    _, xi, eta = surface_tangents(gather_face(face), rule)
     vector = area_vector(xi, eta)
     flat_area = 1.3 * 0.9 * EXTENT[0] * EXTENT[1] / (NX * NY)
     slopes = np.array([0.4 / 1.3, -0.2 / 0.9])
@@ -75,7 +75,7 @@ def test_area_of_a_stretched_and_tilted_face(rule):
 @RULES
 def test_position_and_tangents_equal_a_loop(rule, warped):
     q = quadrature(rule)
-    position, xi, eta = surface_tangents(warped, rule)
+    position, xi, eta = surface_tangents(gather_face(warped), rule)
     for j, i in itertools.product(range(NY), range(NX)):
         np.testing.assert_allclose(position[:, :, j, i], at_points(warped, q, j, i).T, ROUNDOFF, 10 * ROUNDOFF)
     step = 1e-3  # the map is bilinear, so a chord between two points of one edge is the tangent

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.mechanics.face import quadrature
+from opfem.mechanics.face import assemble_face, gather_face, quadrature
 from opfem.mechanics.interaction import ContactFace, ContactIterate, ImposedPressure, RigidSurface, TangentLaw
 from opfem.model import height_field
 from tests.oracles import assemble_dense_face
@@ -25,15 +25,22 @@ NOW = jnp.asarray(1.0)
 SIDES = pytest.mark.parametrize("above", [True, False], ids=["sample", "window"])
 RULES = pytest.mark.parametrize("rule", ["gauss2", "gauss3", "nodes"])
 
-_force = eqx.filter_jit(lambda face, x, history, law=None: face.force(NOW, x, history, law))
-_matrices = eqx.filter_jit(lambda face, x, history, law=None: face.stiffness_matrices(NOW, x, history, law))
-_advance = eqx.filter_jit(lambda face, x, history: face.advance(NOW, x, history))
-_jacobian = eqx.filter_jit(lambda face, x, history, law=None: jax.jacfwd(lambda v: face.force(NOW, v, history, law))(x))
+
+def nodal_force(face, x, history, law=None):
+    return assemble_face(face.force(NOW, gather_face(x), history, law))
 
 
-def contact_face(contact, surface=PLANE, above=False, rule="gauss2", offset=0.0, imposed=None):
+_force = eqx.filter_jit(nodal_force)
+_matrices = eqx.filter_jit(
+    lambda face, x, history, law=None: face.stiffness_matrices(NOW, gather_face(x), history, law)
+)
+_advance = eqx.filter_jit(lambda face, x, history: face.advance(NOW, gather_face(x), history))
+_jacobian = eqx.filter_jit(lambda face, x, history: jax.jacfwd(lambda v: nodal_force(face, v, history))(x))
+
+
+def contact_face(contact, surface=PLANE, above=False, rule="gauss2", offset=0.0, imposed=None, sides=None):
     numbers = (jnp.asarray(v, float) for v in (ELEMENT_SIZE, STIFFNESS))
-    return ContactFace(contact, surface, jnp.asarray(offset, float), imposed, *numbers, above, rule)
+    return ContactFace(contact, surface, jnp.asarray(offset, float), imposed, *numbers, above, rule, sides)
 
 
 def flat(z=0.0, slope=(0.0, 0.0), shape=(NY, NX), extent=EXTENT):
@@ -83,7 +90,7 @@ def test_force_on_a_flat_face_is_pressure_times_area(law, pressure, above):
     level = 0.5 if above else 0.0
     for clearance in (-0.004, 0.004, 0.02):
         x = jnp.array(flat(level - side * clearance))
-        force = np.asarray(_force(face, x, face.initial_history(x)))
+        force = np.asarray(_force(face, x, face.initial_history(gather_face(x))))
         np.testing.assert_allclose(
             force.sum(axis=(1, 2)), [0, 0, -side * pressure(clearance) * AREA], ROUNDOFF, ROUNDOFF
         )
@@ -95,7 +102,7 @@ def test_force_on_a_flat_face_is_pressure_times_area(law, pressure, above):
 def test_force_acts_on_the_current_area(rule):
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.0), rule=rule)
     x = flat(-0.01) * np.array([1.3, 0.8, 1.0])[:, None, None]
-    force = np.asarray(_force(face, jnp.array(x), face.initial_history(jnp.array(x))))
+    force = np.asarray(_force(face, jnp.array(x), face.initial_history(gather_face(jnp.array(x)))))
     np.testing.assert_allclose(force.sum(axis=(1, 2)), [0.0, 0.0, 0.07 * 1.04 * AREA], ROUNDOFF, ROUNDOFF)
 
 
@@ -105,7 +112,7 @@ def test_force_on_a_tilted_plane_is_along_its_normal(above):
     stretch = np.sqrt(1 + slope @ slope)
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.0), plane_surface(0.5, slope), above)
     x = jnp.array(flat(0.5 + side * 0.01, slope))
-    total = np.asarray(_force(face, x, face.initial_history(x))).sum(axis=(1, 2))
+    total = np.asarray(_force(face, x, face.initial_history(gather_face(x)))).sum(axis=(1, 2))
     normal = np.array([-slope[0], -slope[1], 1.0]) / stretch
     # The vertical overclosure of 0.01 is 0.01/stretch along the normal; the area grows by stretch.
     np.testing.assert_allclose(total, -side * 7.0 * 0.01 * AREA * normal, ROUNDOFF)
@@ -116,7 +123,7 @@ def test_offset_moves_the_surface_away_from_the_layer(above):
     side = 1.0 if above else -1.0
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), 0.0), plane_surface(0.5), above, offset=0.004)
     x = jnp.array(flat(0.5 + side * 0.01))
-    total = np.asarray(_force(face, x, face.initial_history(x))).sum(axis=(1, 2))
+    total = np.asarray(_force(face, x, face.initial_history(gather_face(x)))).sum(axis=(1, 2))
     np.testing.assert_allclose(total[2], -side * 7.0 * 0.006 * AREA, ROUNDOFF)
 
 
@@ -129,7 +136,7 @@ def test_surface_moves_in_a_straight_line_from_start_to_end():
 def test_open_contact_has_no_force_and_no_stiffness():
     face = contact_face(op.Contact(EXPONENTIAL, friction=0.2))
     x = jnp.array(flat(2 * C0))
-    history = face.initial_history(x)
+    history = face.initial_history(gather_face(x))
     np.testing.assert_array_equal(_force(face, moved(x, x=0.1), history), 0.0)
     for matrix in _matrices(face, moved(x, x=0.1), history):
         np.testing.assert_array_equal(matrix, 0.0)
@@ -164,7 +171,7 @@ STATES = {
 def bumpy_state(state, rough):
     friction, elastic_slip, slip = STATES[state]
     face = bumpy_face(friction, elastic_slip)
-    history = face.initial_history(jnp.array(rough))
+    history = face.initial_history(gather_face(jnp.array(rough)))
     change = slip * (
         np.array([0.8, 0.6, 0.1])[:, None, None] + 0.2 * np.random.default_rng(1).standard_normal(rough.shape)
     )
@@ -231,11 +238,16 @@ OTHER_FACES = {
     "window with constant sticking slope": lambda x: contact_face(
         op.Contact(op.LinearOverclosure(7.0), 0.3, stick_slope=4.0), rule="gauss3", offset=-0.2
     ),
+    "some of them sides": lambda x: contact_face(
+        op.Contact(SOFT, 0.3), bumpy_surface(0.2), above=True, sides=jnp.array([[True, False], [False, True]])
+    ),
     "dead pressure": lambda x: contact_face(
         op.Contact(EXPONENTIAL, 0.3),
         above=True,
         rule="nodes",
-        imposed=ImposedPressure(jnp.zeros((NY + 1, NX + 1)), jnp.array(0.1 + x[2]), jnp.full((4, NY, NX), 0.2)),
+        imposed=ImposedPressure(
+            jnp.zeros((4, NY, NX)), gather_face(jnp.array(0.1 + x[2:]))[:, 0], jnp.full((4, NY, NX), 0.2)
+        ),
     ),
 }
 
@@ -245,7 +257,7 @@ OTHER_FACES = {
 def test_stiffness_is_minus_the_derivative_of_force(name, slip):
     x = flat(0.1) + 0.02 * np.random.default_rng(2).standard_normal((3, NY + 1, NX + 1))
     face = OTHER_FACES[name](x)
-    history = face.initial_history(jnp.array(x))
+    history = face.initial_history(gather_face(jnp.array(x)))
     now = moved(x, x=slip, y=0.3 * slip)
     exact, _ = _matrices(face, now, history)
     expected = -np.asarray(_jacobian(face, now, history)).reshape(x.size, x.size)
@@ -269,7 +281,7 @@ def test_guard_is_the_whole_stiffness_of_a_face_that_just_touches():
     """Without pressure there is no area change, no geometry and no friction to leave out."""
     face = contact_face(op.Contact(op.HardOverclosure(), friction=0.1))
     x = jnp.array(flat())
-    exact, guard = _matrices(face, x, face.initial_history(x))
+    exact, guard = _matrices(face, x, face.initial_history(gather_face(x)))
     np.testing.assert_allclose(exact, guard, ROUNDOFF, ROUNDOFF)
     total = np.asarray(guard).sum(axis=(0, 1, 4, 5))
     np.testing.assert_allclose(total, np.diag([0.0, 0.0, 1000 * STIFFNESS * AREA]), ROUNDOFF, ROUNDOFF)
@@ -283,7 +295,7 @@ def test_law_linearised_at_its_own_pressure_changes_nothing(state, rough):
     face, x, history = bumpy_state(state, rough)
     point = face.at_points(NOW, _points(face, x), history)
     law = face.tangent_law(
-        NOW, x, history, ContactIterate(point.pressure, jnp.zeros_like(history.elastic)), jnp.ones(())
+        NOW, gather_face(x), history, ContactIterate(point.pressure, jnp.zeros_like(history.elastic)), jnp.ones(())
     )
     assert isinstance(law, TangentLaw)
     own, linear = _force(face, x, history), _force(face, x, history, law)
@@ -296,9 +308,9 @@ def test_linearised_law_is_the_tangent_at_the_iterates_pressure():
     """With a pressure of its own, 0.02 MPa, that the clearance does not have yet."""
     face = contact_face(op.Contact(EXPONENTIAL, friction=0.0))
     x = jnp.array(flat(0.009))
-    history = face.initial_history(x)
+    history = face.initial_history(gather_face(x))
     start = ContactIterate(jnp.full_like(history.pressure, 0.02), jnp.zeros_like(history.elastic))
-    law = face.tangent_law(NOW, x, history, start, jnp.ones(()))
+    law = face.tangent_law(NOW, gather_face(x), history, start, jnp.ones(()))
     low, high = 0.0, 1.0
     for _ in range(200):  # bisection for the s of this pressure
         s = (low + high) / 2
@@ -314,13 +326,15 @@ def test_pressure_follows_the_clearance_over_a_step():
     """A linear law ends at its own pressure after a full step, and halfway after half of one."""
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.0))
     x = jnp.array(flat(-0.01))
-    history = _advance(face, x, face.initial_history(x))
-    law = face.tangent_law(NOW, x, history, face.initial_iterate(history), jnp.ones(()))
+    history = _advance(face, x, face.initial_history(gather_face(x)))
+    law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
     change = moved(np.zeros(x.shape), z=-0.004)
     for length in (1.0, 0.5):
-        after = face.follow(NOW, x, change, history, law, jnp.asarray(length))
+        after = face.follow(NOW, gather_face(x), gather_face(change), history, law, jnp.asarray(length))
         np.testing.assert_allclose(after.pressure, 7.0 * (0.01 + 0.004 * length), ROUNDOFF)
-    opened = face.follow(NOW, x, moved(np.zeros(x.shape), z=0.1), history, law, jnp.asarray(1.0))
+    opened = face.follow(
+        NOW, gather_face(x), gather_face(moved(np.zeros(x.shape), z=0.1)), history, law, jnp.asarray(1.0)
+    )
     np.testing.assert_array_equal(opened.pressure, 0.0)
 
 
@@ -328,11 +342,11 @@ def test_pressure_follows_the_clearance_over_a_step():
 def test_a_sliding_point_that_reverses_sticks_for_one_step(back, sticks):
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.3, elastic_slip=1e-3))
     x = jnp.array(flat(-0.01))
-    history = _advance(face, x, face.initial_history(x))
-    law = face.tangent_law(NOW, x, history, face.initial_iterate(history), jnp.ones(()))
-    slid = face.follow(NOW, moved(x, x=0.02), jnp.zeros_like(x), history, law, jnp.ones(()))
+    history = _advance(face, x, face.initial_history(gather_face(x)))
+    law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
+    slid = face.follow(NOW, gather_face(moved(x, x=0.02)), gather_face(jnp.zeros_like(x)), history, law, jnp.ones(()))
     np.testing.assert_allclose(slid.direction[0], 1e-3, ROUNDOFF)
-    following = face.tangent_law(NOW, moved(x, x=back), history, slid, jnp.ones(()))
+    following = face.tangent_law(NOW, gather_face(moved(x, x=back)), history, slid, jnp.ones(()))
     assert np.all(following.sticks == sticks)
 
 
@@ -372,7 +386,7 @@ def test_coulomb_block_under_cyclic_slip(above, given):
     quarter = np.linspace(0, 0.2, 21)
     cycle = np.concatenate([quarter[-2::-1], -quarter[1:], -quarter[-2::-1], quarter[1:]])
     path = np.concatenate([quarter, cycle, cycle])
-    history = face.initial_history(pressed(0.0, above))
+    history = face.initial_history(gather_face(pressed(0.0, above)))
     forces, dissipated = [], []
     for u in path:
         x = pressed(u, above)
@@ -396,7 +410,7 @@ def test_coulomb_block_under_cyclic_slip(above, given):
 @pytest.mark.parametrize("angle", [0.0, 0.7, 2.5])
 def test_one_large_step_slides_along_itself(angle):
     face, direction = coulomb_block(), np.array([np.cos(angle), np.sin(angle)])
-    history = face.initial_history(pressed(0.0))
+    history = face.initial_history(gather_face(pressed(0.0)))
     x = pressed(0.2, direction=direction)
     np.testing.assert_allclose(tangential_force(face, x, history), -3.0 * direction, 10 * ROUNDOFF, ROUNDOFF)
     after = _advance(face, x, history)
@@ -419,7 +433,7 @@ def test_friction_on_a_slope_is_measured_along_it():
     surface = plane_surface(0.0, (4 / 3, 0.0))
     face = contact_face(op.Contact(op.LinearOverclosure(100.0), friction=0.3, elastic_slip=0.1), surface)
     x = UNIT + np.array([np.zeros((2, 2)), np.zeros((2, 2)), 4 / 3 * UNIT[0] - 5 / 3 * 0.1])
-    history = face.initial_history(jnp.array(x))
+    history = face.initial_history(gather_face(jnp.array(x)))
     start = np.asarray(_force(face, jnp.array(x), history)).sum(axis=(1, 2))
     area, tangent = 5 / 3, np.array([0.6, 0.0, 0.8])
     for u in (0.03, 0.06, 0.3):
@@ -430,12 +444,12 @@ def test_friction_on_a_slope_is_measured_along_it():
 
 @pytest.mark.parametrize("given", [{"elastic_slip": 0.03}, {"stick_slope": 100.0}], ids=["elastic_slip", "stick_slope"])
 def test_no_friction_means_no_tangential_force_and_a_finite_derivative(given):
-    history = coulomb_block().initial_history(pressed(0.0))
+    history = coulomb_block().initial_history(gather_face(pressed(0.0)))
 
     @jax.jit
     def force(friction, u):
         face = contact_face(op.Contact(op.LinearOverclosure(100.0), friction, **given))
-        return face.force(NOW, pressed(0.0) + jnp.stack([u, 0.0, 0.0])[:, None, None], history)[0].sum()
+        return nodal_force(face, pressed(0.0) + jnp.stack([u, 0.0, 0.0])[:, None, None], history)[0].sum()
 
     # A point that slides feels -friction × 10 N; one that has not moved feels nothing.
     for u, slope in ((0.2, -10.0), (0.0, 0.0), (-0.2, 10.0)):
@@ -448,7 +462,7 @@ def test_derivative_by_friction_equals_a_central_difference(rough):
 
     @jax.jit
     def measure(friction):
-        return jnp.sum(bumpy_face(friction, 0.02).force(NOW, x, history)[:2])
+        return jnp.sum(nodal_force(bumpy_face(friction, 0.02), x, history)[:2])
 
     difference = (measure(0.4 + 1e-5) - measure(0.4 - 1e-5)) / 2e-5
     np.testing.assert_allclose(jax.jit(jax.grad(measure))(0.4), difference, FINITE_DIFFERENCE)
@@ -459,7 +473,7 @@ def test_derivative_by_friction_equals_a_central_difference(rough):
 
 def test_opening_forgets_the_elastic_slip():
     face = coulomb_block()
-    stuck = _advance(face, pressed(0.02), face.initial_history(pressed(0.0)))
+    stuck = _advance(face, pressed(0.02), face.initial_history(gather_face(pressed(0.0))))
     np.testing.assert_allclose(stuck.elastic[0], 0.02, ROUNDOFF)
     opened = _advance(face, pressed(0.05, overclosure=-0.01), stuck)
     np.testing.assert_array_equal(opened.elastic, 0.0)
@@ -474,7 +488,7 @@ def test_unloading_keeps_the_elastic_slip_up_to_its_bound():
     """Half of the pressure: a given elastic slip stays, a constant sticking slope slides back to its new bound."""
     kept, bounded = coulomb_block(elastic_slip=0.03), coulomb_block(stick_slope=100.0)
     for face, elastic, force in ((kept, 0.02, -1.0), (bounded, 0.015, -1.5)):
-        stuck = _advance(face, pressed(0.02), face.initial_history(pressed(0.0)))
+        stuck = _advance(face, pressed(0.02), face.initial_history(gather_face(pressed(0.0))))
         half = pressed(0.02, overclosure=0.05)
         np.testing.assert_allclose(tangential_force(face, half, stuck), [force, 0.0], 10 * ROUNDOFF, ROUNDOFF)
         after = _advance(face, half, stuck)
@@ -484,7 +498,7 @@ def test_unloading_keeps_the_elastic_slip_up_to_its_bound():
 
 def test_sticking_returns_all_its_work():
     face = coulomb_block()
-    history = face.initial_history(pressed(0.0))
+    history = face.initial_history(gather_face(pressed(0.0)))
     for u in (0.01, 0.025, -0.02, 0.0):
         history = _advance(face, pressed(u), history)
     np.testing.assert_allclose(history.elastic, 0.0, atol=ROUNDOFF)
@@ -495,30 +509,32 @@ def test_sticking_returns_all_its_work():
 def test_first_contact_starts_without_friction():
     """Slip before closing leaves nothing behind."""
     face = coulomb_block()
-    history = _advance(face, pressed(0.5, overclosure=-0.1), face.initial_history(pressed(0.0, overclosure=-0.1)))
+    history = _advance(
+        face, pressed(0.5, overclosure=-0.1), face.initial_history(gather_face(pressed(0.0, overclosure=-0.1)))
+    )
     np.testing.assert_allclose(tangential_force(face, pressed(0.5), history), 0.0, atol=ROUNDOFF)
 
 
 def test_dead_pressure_bounds_friction_and_does_not_press():
     """Traction loads apply the pressure themselves: 0.2 MPa × 0.3 × reference area, wherever the layer is."""
-    pressure = jnp.full((2, 2), 0.2)
-    imposed = ImposedPressure(jnp.zeros((2, 2)), pressure, jnp.full((4, 1, 1), 2.0))
+    pressure = jnp.full((4, 1, 1), 0.2)
+    imposed = ImposedPressure(0.0 * pressure, pressure, jnp.full((4, 1, 1), 2.0))
     face = contact_face(op.Contact(EXPONENTIAL, 0.3), above=True, rule="nodes", imposed=imposed)
-    history = face.initial_history(jnp.array(UNIT))
+    history = face.initial_history(gather_face(jnp.array(UNIT)))
     for z in (-3.0, 3.0):
         total = np.asarray(_force(face, moved(UNIT, x=0.5, z=z), history)).sum(axis=(1, 2))
         np.testing.assert_allclose(total, [-0.3 * 0.2 * 2.0, 0.0, 0.0], ROUNDOFF, ROUNDOFF)
     halfway = imposed.at_points(jnp.asarray(0.5), "nodes")
     np.testing.assert_allclose(halfway, 0.1, ROUNDOFF)
-    pulling = ImposedPressure(jnp.zeros((2, 2)), -pressure, imposed.area)
+    pulling = ImposedPressure(0.0 * pressure, -pressure, imposed.area)
     np.testing.assert_array_equal(pulling.at_points(NOW, "nodes"), 0.0)
 
 
 def test_jit_equals_eager_and_vmap_a_loop(rough):
     face, x, history = bumpy_state("sticking and sliding", rough)
     states = jnp.stack([x, jnp.array(rough)])
-    lanes = jax.jit(jax.vmap(lambda v: face.force(NOW, v, history)))(states)
+    lanes = jax.jit(jax.vmap(lambda v: nodal_force(face, v, history)))(states)
     for state, lane in zip(states, lanes, strict=True):
-        eager = np.asarray(face.force(NOW, state, history))
+        eager = np.asarray(nodal_force(face, state, history))
         for got in (lane, _force(face, state, history)):
             np.testing.assert_allclose(got, eager, ROUNDOFF, ROUNDOFF * np.abs(eager).max())
