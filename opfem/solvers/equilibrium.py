@@ -183,6 +183,23 @@ class Problem(eqx.Module):
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
         return self.project(jnp.asarray(self.free) * self._unbalanced(forces), held)
 
+    def balance(self, u: Nodal, fraction: Array, state: State, held: Array) -> Nodal:
+        """Compute the equations that a converged displacement fulfils, as many as unknowns [N].
+
+        The residual of the free unknowns; a spring to the prescribed value for the others, and to the
+        last state for the rigid motion that is held.
+        """
+        free = jnp.asarray(self.free)
+        residual = self.residual(self.forces(u, fraction, state), held)
+        misplaced = free * (u - state.u) + (1.0 - free) * (u - self.with_imposed(u, fraction))
+        return residual + self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
+
+    @property
+    def typical_stiffness(self) -> Array:
+        """A typical stiffness of a node [N/mm]."""
+        hx, hy = self.body.geometry.spacing
+        return self.body.material.shear * hx * hy / jnp.mean(self.body.geometry.depth)
+
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
         applied = self.reactions(forces).applied
@@ -230,12 +247,20 @@ class Problem(eqx.Module):
             return forces.spring
         return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self._unbalanced(forces))[:2, 0]), 0.0)
 
-    def tangent(self, u: Nodal, fraction: Array, state: State, laws: Bodies) -> tuple[Stencil, Array, Array]:
+    def tangent(
+        self, u: Nodal, fraction: Array, state: State, laws: Bodies, transposed: bool = False
+    ) -> tuple[Stencil, Array]:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
+        Args:
+            u: Displacement [mm].
+            fraction: Load fraction [-].
+            state: Where the increment started.
+            laws: Linearised contact laws; empty for the contact's own.
+            transposed: Whether to return the transposed stencil.
+
         Returns:
-            The exact stencil [N/mm], the guarded element matrices for the preconditioner, and
-            a typical stiffness.
+            The exact stencil [N/mm], and the guarded element matrices for the preconditioner.
         """
         K = _single(self.body).stiffness(_single(u))
         K = K + _single(self._drag(self.viscosity)) * _LUMPED
@@ -249,9 +274,7 @@ class Problem(eqx.Module):
             if both is not None:
                 K = add_matrices(K, _single(both[0]), body)
                 guarded = add_matrices(guarded, _single(both[1]), body)
-        hx, hy = self.body.geometry.spacing
-        depth = jnp.mean(self.body.geometry.depth)
-        scale = self.body.material.shear * hx * hy / depth
+        scale = self.typical_stiffness
         if self.spring is not None:
             K = add_matrices(K, _single(self._foundation(jnp.sum(self.spring))), "window")
         if self.spring is not None or any(self.supports.drifts):
@@ -262,7 +285,9 @@ class Problem(eqx.Module):
         free = self.free
         if not free.all():
             K = held(K, jnp.asarray(free))
-        return with_unit_diagonal(assemble_stencil(K), scale), guarded, scale
+        if transposed:
+            K = jnp.transpose(K, (0, 2, 1, 4, 3, 5, 6))
+        return with_unit_diagonal(assemble_stencil(K), scale), guarded
 
     def _drag(self, viscosity: Array) -> Array:
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""

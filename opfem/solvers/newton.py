@@ -16,9 +16,9 @@ from .._checks import check_positive
 from ..mechanics.boundary import Bodies
 from ..mechanics.face import FaceRule
 from .equilibrium import Forces, Problem, State
-from .krylov import fgmres
+from .krylov import KrylovResult, fgmres
 from .multigrid import apply_multigrid, build_multigrid
-from .stencil import Nodal, apply_stencil
+from .stencil import Nodal, Stencil, apply_stencil
 
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
@@ -50,6 +50,8 @@ class Newton(eqx.Module):
         max_backtracks: Halvings of a Newton step that inverts an element, before the increment is cut.
         step_limit: Furthest move of a node in one Newton step, in element sizes, beyond four
             times the mean move: a corner that slips over a ridge must not take its neighbours along.
+        max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
+            solve keeps as many displacement fields. Beyond, derivatives are NaN.
         face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes".
 
     Raises:
@@ -65,6 +67,7 @@ class Newton(eqx.Module):
     max_backtracks: float | int | Array = 6
     step_limit: float | int | Array = 0.1
     max_increments: int = eqx.field(static=True, default=400)
+    max_path: int = eqx.field(static=True, default=64)
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
 
     def as_leaves(self) -> "Newton":
@@ -78,6 +81,7 @@ class Newton(eqx.Module):
             "max_steps",
             "min_increment",
             "max_increments",
+            "max_path",
             "krylov_rtol",
             "krylov_steps",
         ):
@@ -130,19 +134,9 @@ def solve_increment(
     def step(it):
         settled = is_settled(it.size, it.tolerance) | (it.steps == 0)
         laws = problem.tangent_laws(it.u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
-        S, guarded, scale = problem.tangent(it.u, fraction, state, laws)
-        free = problem.free
-        multigrid = build_multigrid(guarded, None if free.all() else free, scale)
         r = problem.residual(problem.with_contact(it.forces, it.u, fraction, state, laws), held)
-        solution = fgmres(
-            lambda v: problem.project(apply_stencil(S, problem.project(v, held)), held),
-            lambda v: problem.project(apply_multigrid(multigrid, v), held),
-            -r,
-            settings.krylov_rtol,
-            basis=_KRYLOV_BASIS,
-            max_iterations=settings.krylov_steps,
-        )
-        direction = problem.project(_limited(problem, solution.x, settings.step_limit), held) * free
+        solution = solve_tangent(problem, problem.tangent(it.u, fraction, state, laws), -r, held, settings)
+        direction = problem.project(_limited(problem, solution.x, settings.step_limit), held) * problem.free
 
         def shorten(carry):
             length, count, *_ = carry
@@ -177,6 +171,22 @@ def solve_increment(
         krylov=end.krylov,
         residual=end.size / end.tolerance * settings.rtol,
         forces=end.forces,
+    )
+
+
+def solve_tangent(
+    problem: Problem, tangent: tuple[Stencil, Array], b: Nodal, held: Array, settings: Newton
+) -> KrylovResult:
+    """Solve one linear system with the tangent, on free unknowns without the held rigid motions."""
+    S, guarded = tangent
+    multigrid = build_multigrid(guarded, None if problem.free.all() else problem.free, problem.typical_stiffness)
+    return fgmres(
+        lambda v: problem.project(apply_stencil(S, problem.project(v, held)), held),
+        lambda v: problem.project(apply_multigrid(multigrid, v), held),
+        b,
+        settings.krylov_rtol,
+        basis=_KRYLOV_BASIS,
+        max_iterations=settings.krylov_steps,
     )
 
 

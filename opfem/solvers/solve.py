@@ -7,6 +7,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ..model import Load, Palpation
+from .derivative import follow_path
 from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
 from .newton import Newton
@@ -50,25 +51,24 @@ def solve(
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
-    problem, initial = _prepare(
-        palpation, load, load_start, solver, None if start is None else start.last_converged.state
-    )
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((problem, initial)))
-    run = _run_traced if traced else _run_with_progress
+    first = None if start is None else start.last_converged.state
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((palpation, load, load_start, first, solver)))
+    problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
+    run = _run_differentiable if traced else _run_with_progress
     stepping = run(problem, initial, solver, progress)
     if getattr(load, "correct_approach", False):
-        problem, stepping = _correct_approach(palpation, load, load_start, solver, problem, stepping, run, progress)
+        problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, progress)
     solution = _finish(problem, stepping, palpation, load)
     return _raise_on_failure(solution, traced) if throw else solution
 
 
 @eqx.filter_jit
-def _prepare(palpation, load, load_start, solver, state: State | None) -> tuple[Problem, Stepping]:
+def _prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
     problem = discretise(palpation, load, load_start, solver.face_rule)
     if state is None:
-        return problem, begin(problem.initial_state(), solver)
+        return problem, begin(problem.initial_state(), solver, traced)
     restarted = eqx.tree_at(lambda s: s.fraction, state, jnp.zeros_like(state.fraction))
-    return problem, begin(restarted, solver)
+    return problem, begin(restarted, solver, traced)
 
 
 _attempt = eqx.filter_jit(attempt)
@@ -83,19 +83,21 @@ def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, pro
     return stepping
 
 
-def _run_traced(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
-    return jax.lax.while_loop(unfinished, lambda s: attempt(problem, s, solver), stepping)
+def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
+    frozen, start, settings = jax.lax.stop_gradient((problem, stepping, solver))
+    end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
+    assert end.path is not None
+    before, state = follow_path(problem, stepping.state, end.path, end.kept, settings)
+    return end._replace(before=before, state=state, path=None)
 
 
-def _correct_approach(
-    palpation, load, load_start, solver, problem, stepping, run, progress
-) -> tuple[Problem, Stepping]:
+def _correct_approach(palpation, load, solver, problem, stepping, run, progress) -> tuple[Problem, Stepping]:
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
         offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
         shifted = eqx.tree_at(lambda p: p.contacts.sample.offset, problem, offset)
         # The surface is in place; what is left is one increment at the full load.
-        again = begin(stepping.state, solver)
+        again = begin(stepping.state, solver, run is _run_differentiable)
         state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)
         again = again._replace(
             state=state,

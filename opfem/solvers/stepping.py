@@ -14,7 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .equilibrium import Forces, Problem, State
 from .newton import Newton, solve_increment
@@ -41,6 +41,15 @@ _SNAP_SOLVES = 80
 _BALANCED = 1e-4
 
 
+class Path(NamedTuple):
+    """The solves that led to a state, one after the other, in arrays of fixed length."""
+
+    u: Float[Array, "n 3 mz my mx"]
+    fraction: Float[Array, " n"]
+    held: Bool[Array, " n"]
+    viscosity: Float[Array, " n"]
+
+
 class Stepping(NamedTuple):
     """Progress of a solve.
 
@@ -62,6 +71,9 @@ class Stepping(NamedTuple):
         slides: Whether the hold carries a lateral force at the last converged state.
         failed: Whether the solve has given up.
         fractions: Load fraction of every accepted increment, NaN beyond.
+        path: The solves that led to `origin`, for derivatives; None where none are asked for.
+        length: How many solves of `path` led to `origin`.
+        kept: How many of them led to `state`.
     """
 
     state: State
@@ -81,12 +93,17 @@ class Stepping(NamedTuple):
     slides: Array
     failed: Array
     fractions: Float[Array, " attempts"]
+    path: Path | None
+    length: Array
+    kept: Array
 
 
-def begin(state: State, settings: Newton) -> Stepping:
+def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
     """Start at a converged state."""
     dtype = state.u.dtype
     none, zero, no = jnp.zeros((), int), jnp.zeros((), dtype), jnp.asarray(False)
+    slots = settings.max_path
+    path = Path(jnp.zeros((slots, *state.u.shape), dtype), *(jnp.zeros(slots, t) for t in (dtype, bool, dtype)))
     return Stepping(
         state=state,
         before=state,
@@ -105,6 +122,9 @@ def begin(state: State, settings: Newton) -> Stepping:
         slides=no,
         failed=no,
         fractions=jnp.full(settings.max_increments, jnp.nan, dtype),
+        path=path if with_path else None,
+        length=none,
+        kept=none,
     )
 
 
@@ -124,7 +144,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     snapping = (s.viscosity > 0) | (s.origin.fraction > s.state.fraction)
     span = s.state.fraction - s.before.fraction
     ahead = jnp.where((span > 0) & ~snapping, increment / jnp.where(span > 0, span, 1.0), 0.0)
-    guess = s.origin.u + ahead * (s.state.u - s.before.u)
+    guess = s.origin.u + ahead * problem.project(s.state.u - s.before.u, held)
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, s.viscosity)
     on_the_way = (_VISCOUS_RTOL, _VISCOUS_STEPS)
     limits = [
@@ -151,6 +171,8 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
 
     state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
     origin = _where(goes_on, _where(ok, result.state, s.origin), state)
+    moves_on = accepted | (goes_on & ok)
+    length = jnp.where(moves_on, s.length + 1, jnp.where(goes_on, s.length, s.kept))
     can_release, slides = _hold_balance(problem, result.forces, result.state)
     attempts = s.attempts + 1
     return Stepping(
@@ -171,7 +193,20 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         slides=jnp.where(accepted, slides, s.slides),
         failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
         fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
+        path=None if s.path is None else _recorded(s, moves_on, Path(result.state.u, fraction, held, s.viscosity)),
+        length=length,
+        kept=jnp.where(accepted, length, s.kept),
     )
+
+
+def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:
+    """Write one solve into the path at its end, if it moved on."""
+
+    def write(slots, value):
+        value = jnp.where(moves_on, value, slots[jnp.minimum(s.length, slots.shape[0] - 1)])
+        return jax.lax.dynamic_update_index_in_dim(slots, value, s.length, axis=0)
+
+    return jax.tree.map(write, s.path, solve)
 
 
 def _next_viscosity(s: Stepping, state: State, ok: Array, steps: Array, snapping: Array) -> tuple[Array, Array]:

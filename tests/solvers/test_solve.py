@@ -110,7 +110,7 @@ def test_cut_back_restores_the_state_and_equals_asking_for_the_smaller_increment
     from opfem.solvers.solve import _attempt, _prepare
 
     settings = op.Newton().as_leaves()
-    problem, start = _prepare(palpation(), op.Imprint(bumpy()), None, settings, None)
+    problem, start = _prepare(palpation(), op.Imprint(bumpy()), None, settings, None, False)
     first = _attempt(problem, start, settings)
     whole = first._replace(increment=jnp.asarray(0.25))
     failed = _attempt(problem, whole, op.Newton(max_steps=1).as_leaves())
@@ -130,7 +130,7 @@ def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
     from opfem.solvers.solve import _attempt, _prepare
 
     settings = op.Newton(increments=4).as_leaves()
-    problem, start = _prepare(palpation(0.0, 0.0), op.Imprint(bumpy()), None, settings, None)
+    problem, start = _prepare(palpation(0.0, 0.0), op.Imprint(bumpy()), None, settings, None, False)
     direct = _attempt(problem, start, settings)
     snap = start._replace(viscosity=jnp.asarray(1.5))
     on_the_way = 0
