@@ -4,10 +4,14 @@ Units are mm, N, MPa, s, tonne; maps are indexed [y, x]; tension is positive and
 pressure is positive in compression.
 """
 
+from typing import Any
+
+from . import datasets as datasets
 from .io import (
     read_netcdf as read_netcdf,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
+    write_pvd as write_pvd,
     write_thickness as write_thickness,
     write_vtu as write_vtu,
 )
@@ -35,3 +39,14 @@ from .solvers import (
     Solution as Solution,
     solve as solve,
 )
+
+_PICTURES = ("plot_layer", "plot_pressure", "plot_residual", "plot_status", "plot_thickness", "report_figure")
+
+
+def __getattr__(name: str) -> Any:
+    """Load pictures when one is asked for: they bring matplotlib and pyvista."""
+    if name in _PICTURES:
+        from . import plot
+
+        return getattr(plot, name)
+    raise AttributeError(f"module 'opfem' has no attribute {name!r}")

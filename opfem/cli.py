@@ -20,6 +20,7 @@ from cyclopts import App, Group, Parameter
 from rich.console import Console
 from rich.table import Table
 
+from .datasets import COIN_LAYER, coin_file
 from .io import read_thickness, whole_file, write_netcdf, write_thickness, write_vtu
 from .measurement import EXAMPLE_LAYER, ThicknessMap, example_map
 from .model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
@@ -32,6 +33,7 @@ FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", FINISHED)
 # The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
 INTERRUPTED = 130
+_ELEMENTS = (40, 40, 4)
 
 app = App(
     name="opfem",
@@ -79,9 +81,7 @@ class LayerOptions:
         tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
     ] = None
     elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
-        40,
-        40,
-        4,
+        _ELEMENTS
     )
     element: Annotated[
         Literal["mean_dilatation", "full"], Parameter(help="Element; only the default is free of locking.")
@@ -172,6 +172,27 @@ def palpate(
             raise
         write_results(solution, measured, settings, out)
         _show_results(solution, out)
+
+
+@app.command
+def demo(
+    *,
+    out: Path = Path("opfem_demo"),
+    coin: Annotated[bool, Parameter(help="Take the published map of a 5-cent coin (downloaded once, GPL-3).")] = False,
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Show what opfem does: the stress map of a built-in measurement, or of the published coin.
+
+    Args:
+        out: Folder of the results.
+        coin: Which measurement.
+        run: The run itself.
+    """
+    if not coin:
+        return palpate("example", out=out, run=run)
+    with _reporting(run.debug):
+        path = coin_file()
+    palpate(str(path), out=out, reading=MapOptions(l0=str(COIN_LAYER), extent=(5.0, 5.0)), run=run)
 
 
 def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | ThicknessMap]:

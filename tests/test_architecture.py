@@ -20,7 +20,8 @@ MAY_IMPORT |= {
     "_types": set(),
     "_checks": set(),
     "io": {"io", "measurement", "model", "results"},
-    "plot": {"plot", "measurement", "results"},
+    "plot": {"plot", "io", "measurement", "results"},
+    "datasets": {"datasets", "io", "measurement"},
     "sweep": {"sweep", "io", *CHAIN},
 }
 SEE_ALL = {"__init__", "cli"}
@@ -32,6 +33,7 @@ LIBRARY_HOMES = {
     "pyvista": {"io", "plot"},
     "vtk": {"io", "plot"},
     "matplotlib": {"plot"},
+    "pooch": {"datasets"},
 }
 NO_FILE_CLOCK_LOGGER = {"os", "io", "pathlib", "shutil", "tempfile", "time", "datetime", "logging"}
 FORBIDDEN_NAMES = {"utils", "util", "helpers", "common", "core", "misc"}

@@ -274,3 +274,18 @@ def test_help_in_a_fresh_process():
     code = "import opfem.cli, jax, sys; print(jax.config.jax_enable_x64, 'matplotlib' in sys.modules)"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "False False"
+
+
+@pytest.mark.parametrize("coin", [False, True], ids=["example", "coin"])
+def test_demo_solves_a_sample_of_its_own(tmp_path, monkeypatch, shared, solved, coin):
+    monkeypatch.setenv("OPFEM_DATA", str(tmp_path / "data"))
+    if coin:
+        (tmp_path / "data").mkdir()
+        name = "coin_5c_1-thickness.mat"
+        (tmp_path / "data" / name).write_bytes((shared / "data" / name).read_bytes())
+    monkeypatch.setattr(cli, "write_results", lambda solution, measured, settings, out: None)
+    assert opfem("demo", *["--coin"] * coin, "--out", tmp_path / "demo") == 0
+    ((palpation, load, _),) = solved
+    assert load.thickness.shape == ((502, 502) if coin else (201, 201))
+    np.testing.assert_allclose(palpation.extent, 5.0)
+    assert float(palpation.layer.thickness) == 0.5

@@ -4,14 +4,16 @@ from ..measurement import MeasurementError
 from .atomic import whole_file
 from .netcdf import read_netcdf, write_netcdf
 from .thickness import read_thickness, write_thickness
-from .vtk import write_vtu
+from .vtk import layer_grid, write_pvd, write_vtu
 
 __all__ = [
     "MeasurementError",
+    "layer_grid",
     "read_netcdf",
     "read_thickness",
     "whole_file",
     "write_netcdf",
+    "write_pvd",
     "write_thickness",
     "write_vtu",
 ]

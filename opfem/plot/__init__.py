@@ -1,5 +1,6 @@
-"""Pictures of maps; `import opfem` does not load this part, because it loads matplotlib."""
+"""Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
 from .maps import plot_pressure, plot_residual, plot_status, plot_thickness, report_figure
+from .scene import plot_layer
 
-__all__ = ["plot_pressure", "plot_residual", "plot_status", "plot_thickness", "report_figure"]
+__all__ = ["plot_layer", "plot_pressure", "plot_residual", "plot_status", "plot_thickness", "report_figure"]

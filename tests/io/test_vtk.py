@@ -51,8 +51,27 @@ def test_stress_lies_in_the_top_cells(written, solution):
 
 
 def test_errors(tmp_path, solution, failed_solution):
-    with pytest.raises(ValueError, match=r"writes \.vtu"):
+    with pytest.raises(ValueError, match=r"must end in \.vtu"):
         op.write_vtu(op.to_xarray(solution), tmp_path / "a.vtk")
     with pytest.raises(ValueError, match="needs a converged solution"):
         op.write_vtu(op.to_xarray(failed_solution), tmp_path / "a.vtu")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_series_lists_its_states_in_order(tmp_path, solution):
+    """As ParaView reads it: names relative to the .pvd file, times that rise, each file the state itself."""
+    data = op.to_xarray(solution)
+    op.write_pvd([data, data.assign(displacement=0.5 * data.displacement)], tmp_path / "run.pvd", times=[0.5, 2.0])
+    assert sorted(os.listdir(tmp_path)) == ["run.pvd", "run_000.vtu", "run_001.vtu"]
+    series = pyvista.PVDReader(tmp_path / "run.pvd")
+    assert series.time_values == [0.5, 2.0]
+    series.set_active_time_value(2.0)
+    half = np.asarray(solution.positions + 0.5 * solution.displacement).reshape(3, -1).T
+    np.testing.assert_allclose(series.read()[0].points, half, rtol=tol.ROUNDOFF, atol=tol.ROUNDOFF)
+
+
+@pytest.mark.parametrize(("states", "times"), [(0, None), (2, [1.0]), (2, [1.0, 1.0])])
+def test_a_series_needs_one_rising_time_for_each_state(tmp_path, solution, states, times):
+    with pytest.raises(ValueError, match="one rising time for each"):
+        op.write_pvd([op.to_xarray(solution)] * states, tmp_path / "run.pvd", times)
     assert os.listdir(tmp_path) == []

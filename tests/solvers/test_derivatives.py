@@ -5,6 +5,7 @@ status, else the difference would not agree to the tolerance.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -54,10 +55,10 @@ def contacts(numbers: Numbers) -> dict[str, op.Contact]:
     }
 
 
-def frictional_imprint(numbers: Numbers, settings: op.Newton = ACCURATE) -> op.Solution:
+def frictional_imprint(numbers: Numbers) -> op.Solution:
     layer = op.Layer(numbers["L0"], op.MooneyRivlin(numbers["c10"], numbers["c01"], numbers["bulk"]))
     palpation = op.Palpation(layer, numbers["extent"], (8, 8, 2), **contacts(numbers))
-    return op.solve(palpation, op.Imprint(op.ThicknessMap(numbers["map"], extent=SIZE)), settings)
+    return op.solve(palpation, op.Imprint(op.ThicknessMap(numbers["map"], extent=SIZE)), ACCURATE)
 
 
 def traction_on_a_bonded_layer(numbers: Numbers) -> op.Solution:
@@ -68,11 +69,11 @@ def traction_on_a_bonded_layer(numbers: Numbers) -> op.Solution:
     return op.solve(palpation, op.Traction(numbers["normal"]), ACCURATE)
 
 
-def displacement_on_a_spring(numbers: Numbers) -> op.Solution:
+def displacement_on_a_spring(numbers: Numbers, settings: op.Newton = ACCURATE) -> op.Solution:
     layer = op.Layer(0.5, op.NeoHooke(numbers["shear"], numbers["bulk"]))
     window = op.Contact(op.HardOverclosure(), numbers["friction"])
     palpation = op.Palpation(layer, SIZE, (4, 4, 2), window, op.Roller(), hold=numbers["hold"], element="full")
-    return op.solve(palpation, op.Displacement(-numbers["map"]), ACCURATE)
+    return op.solve(palpation, op.Displacement(-numbers["map"]), settings)
 
 
 def corrected_and_continued(numbers: Numbers) -> op.Solution:
@@ -96,7 +97,7 @@ FRICTIONAL = {
     "c10": 2.2e-3,
     "c01": 7.03e-4,
     "bulk": 0.11612,
-    "extent": np.array([1.93, 1.91]),  # so that no node of the mesh lies on a pixel of the map, where it has kinks
+    "extent": np.array([1.957, 1.973]),  # keeps nodes off the pixels of the map and pixels off nodes: kinks
     "map": 0.5 - bump(41),
     **CONTACT,
 }
@@ -111,11 +112,16 @@ CASES = {
     ),
     "preload, approach taken out": Case(corrected_and_continued, {"c10": 2.2e-3, "map": bump(21), **CONTACT}),
 }
+CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
+SLOW = {"preload, approach taken out": [pytest.mark.slow]}
 
 
-def forward_and_reverse(f: Callable, numbers: Numbers, direction: Numbers) -> tuple[Any, Any, Numbers]:
+@partial(jax.jit, static_argnums=0)
+def forward_and_reverse(
+    solve: Callable[[Numbers], op.Solution], numbers: Numbers, direction: Numbers
+) -> tuple[jax.Array, jax.Array, Numbers]:
     """Value, derivative along a direction, and gradient, of one linearisation."""
-    value, along = jax.linearize(f, numbers)
+    value, along = jax.linearize(lambda n: measure(solve(n)), numbers)
     (gradient,) = jax.linear_transpose(along, numbers)(jnp.ones(()))
     return value, along(direction), gradient
 
@@ -126,62 +132,48 @@ def relative(numbers: Numbers, seed: int) -> Numbers:
     return {name: value * rng.uniform(-1, 1, np.shape(value)) for name, value in numbers.items()}
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in CASES])
 def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
-    case = CASES[name]
-    numbers = jax.tree.map(jnp.asarray, case.numbers)
-
-    def f(numbers):
-        return measure(case.solve(numbers))
-
+    solve, numbers = CASES[name]
+    numbers = jax.tree.map(jnp.asarray, numbers)
     direction = relative(numbers, 1)
-    value, forward, gradient = jax.jit(lambda n, d: forward_and_reverse(f, n, d))(numbers, direction)
-    np.testing.assert_allclose(value, f(numbers), SOLVER)
-    terms = [float(jnp.vdot(gradient[name], direction[name])) for name in numbers]
+    value, forward, gradient = forward_and_reverse(solve, numbers, direction)
+    np.testing.assert_allclose(value, measure(solve(numbers)), SOLVER)
+    terms = [float(jnp.vdot(gradient[number], direction[number])) for number in numbers]
     assert abs(sum(terms) - float(forward)) <= 1e-8 * np.abs(terms).sum()
+    frictionless = name == "no friction"
     for number, value in numbers.items():
+        if frictionless and number.endswith("friction"):
+            continue  # friction cannot be negative
         change = relative(numbers, 2)[number] if value.ndim else value
-        ends = [float(f({**numbers, number: value + sign * STEP * change})) for sign in (1, -1)]
+        ends = [float(measure(solve({**numbers, number: value + sign * STEP * change}))) for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * STEP)
         expected = float(jnp.vdot(gradient[number], change))
         assert expected == pytest.approx(difference, rel=FINITE_DIFFERENCE, abs=1e-8), number
 
 
-def test_gradient_of_a_frictionless_layer():
-    numbers = {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0}
-    numbers = jax.tree.map(jnp.asarray, numbers)
-
-    def mean_pressure(numbers):
-        return 1e3 * frictional_imprint(numbers).pressure.mean()
-
-    gradient = jax.grad(mean_pressure)(numbers)
-    for number in ("c10", "bulk", "L0", "map"):
-        change = 0.5 - bump(41) if number == "map" else numbers[number]
-        ends = [float(mean_pressure({**numbers, number: numbers[number] + s * STEP * change})) for s in (1, -1)]
-        difference = (ends[0] - ends[1]) / (2 * STEP)
-        assert float(jnp.vdot(gradient[number], change)) == pytest.approx(difference, rel=FINITE_DIFFERENCE)
-
-
+@pytest.mark.slow
 def test_vmap_over_four_materials_equals_the_loop_and_jit_equals_eager():
-    numbers = CASES["preload, approach taken out"].numbers
+    numbers = CASES["displacement on a spring"].numbers
 
-    def gradient(c10):
-        return jax.grad(lambda c: 1e3 * corrected_and_continued({**numbers, "c10": c}).pressure.max())(c10)
+    def gradient(shear):
+        return jax.grad(lambda s: 1e3 * displacement_on_a_spring({**numbers, "shear": s}).pressure.max())(shear)
 
-    materials = jnp.array([1e-3, 2e-3, 4e-3, 8e-3])
+    materials = jnp.array([2e-3, 4e-3, 8e-3, 16e-3])
     compiled = jax.jit(gradient)
-    loop = [compiled(c10) for c10 in materials]
+    loop = [compiled(shear) for shear in materials]
     np.testing.assert_allclose(jax.jit(jax.vmap(gradient))(materials), loop, 1e-6)
     np.testing.assert_allclose(gradient(materials[1]), loop[1], 1e-6)
 
 
+@pytest.mark.slow
 def test_a_path_too_long_to_record_has_no_derivative():
-    numbers = jax.tree.map(jnp.asarray, FRICTIONAL)
+    numbers = CASES["displacement on a spring"].numbers
 
-    def mean_pressure(c10):
-        solution = frictional_imprint({**numbers, "c10": c10}, op.Newton(increments=3, max_path=2))
+    def mean_pressure(shear):
+        solution = displacement_on_a_spring({**numbers, "shear": shear}, op.Newton(increments=3, max_path=2))
         return 1e3 * solution.pressure.mean()
 
-    value, gradient = jax.jit(jax.value_and_grad(mean_pressure))(numbers["c10"])
+    value, gradient = jax.jit(jax.value_and_grad(mean_pressure))(5.8e-3)
     assert np.isfinite(value)
     assert np.isnan(gradient)

@@ -1,0 +1,42 @@
+"""The 3-D scene renders without a display, in the colours of the numbers it shows."""
+
+import numpy as np
+import pytest
+import pyvista
+
+import opfem as op
+
+
+@pytest.fixture
+def plotter():
+    plotter = pyvista.Plotter(off_screen=True, window_size=(600, 400))
+    yield plotter
+    plotter.close()
+
+
+@pytest.mark.parametrize(("colour", "title"), [("pressure", "Contact pressure [kPa]"), ("stress_zz", "-S33")])
+def test_scene_renders_and_returns_its_plotter(solution, plotter, colour, title):
+    assert op.plot_layer(solution, plotter, colour=colour) is plotter
+    assert next(iter(plotter.scalar_bars.keys())).startswith(title)
+    picture = plotter.screenshot(return_img=True)
+    assert picture.shape[:2] == (400, 600)
+    # The layer covers a good part of the picture, and its top is coloured (viridis is never grey).
+    coloured = np.ptp(picture.astype(int), axis=2) > 40
+    assert 0.05 < coloured.mean() < 0.6
+    assert (picture == 255).all(axis=2).mean() > 0.2
+
+
+def test_colours_span_the_pressure_in_kpa(solution, plotter):
+    op.plot_layer(op.to_xarray(solution), plotter)
+    low, high = plotter.mapper.scalar_range
+    assert low == 0.0
+    assert high == pytest.approx(1e3 * float(solution.pressure.max()))
+    bounds = plotter.actors and plotter.mesh.bounds
+    assert bounds.z_max - bounds.z_min < 0.55  # the mesh itself is not stretched
+
+
+def test_errors(solution, failed_solution, plotter):
+    with pytest.raises(ValueError, match="needs a converged solution"):
+        op.plot_layer(failed_solution, plotter)
+    with pytest.raises(ValueError, match=r'"pressure" or "stress_zz", got \'red\''):
+        op.plot_layer(solution, plotter, colour="red")
