@@ -137,6 +137,16 @@ def test_example_is_written_and_is_its_own_input(tmp_path, monkeypatch):
 
 
 class TestRefusals:
+    def test_unloaded_map_on_another_grid(self, tmp_path, map_file, solved, capsys):
+        np.save(tmp_path / "l0.npy", np.full((17, 20), 0.5))
+        message = self.refused(capsys, map_file, "--extent", 2, 2, "--l0", tmp_path / "l0.npy", "--out", tmp_path / "o")
+        assert "--l0 [pixels] must be on the grid of MAP, (17, 21)" in message
+        assert "got (17, 20). Resample" in message
+
+    def test_map_smaller_than_the_layer(self, tmp_path, map_file, solved, capsys):
+        message = self.refused(capsys, map_file, *SMALL, "--layer-extent", 2, 2.5, "--out", tmp_path / "o")
+        assert "--layer-extent [mm] must lie on the map, which ends at x, y = [2.0, 2.0], got (2.0, 2.5)" in message
+
     def refused(self, capsys, *arguments, status=1) -> str:
         assert opfem("palpate", *arguments) == status
         said = capsys.readouterr()

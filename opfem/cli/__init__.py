@@ -10,107 +10,41 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
-from cyclopts import App, Group, Parameter
+from cyclopts import App, Parameter
 from rich.console import Console
 from rich.table import Table
 
-from .datasets import COIN_LAYER, coin_file
-from .io import read_thickness, whole_file, write_netcdf, write_thickness, write_vtu
-from .measurement import EXAMPLE_LAYER, ThicknessMap, example_map
-from .model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
-from .results import summary, summary_rows, to_xarray
-from .solvers import ConvergenceError, Newton, Solution, solve
+from ..datasets import COIN_LAYER, coin_file
+from ..io import read_thickness, whole_file, write_netcdf, write_thickness, write_vtu
+from ..measurement import EXAMPLE_LAYER, ThicknessMap, example_map
+from ..model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
+from ..results import summary, summary_rows, to_xarray
+from ..solvers import ConvergenceError, Newton, Solution, solve
+from .options import (
+    PUBLISHED_BULK,
+    PUBLISHED_C01,
+    PUBLISHED_C10,
+    ContactOptions,
+    LayerOptions,
+    MapOptions,
+    RunOptions,
+)
 
 FINISHED = "result.nc"  # Written last: a folder that holds it holds a whole result.
 FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", FINISHED)
 
-# The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
-PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
 INTERRUPTED = 130
-_ELEMENTS = (40, 40, 4)
 
 app = App(
     name="opfem",
     help="Stress on tissue from the measured thickness of a soft layer.",
     default_parameter=Parameter(negative=()),
 )
-
-
-@Parameter(name="*", group=Group("Map", sort_key=1))
-@dataclass(frozen=True)
-class MapOptions:
-    """How to read the loaded and the unloaded thickness."""
-
-    l0: Annotated[str | None, Parameter(help="Unloaded thickness: a number in mm, or the path of a map.")] = None
-    extent: Annotated[
-        tuple[float, float] | None, Parameter(help="LX LY from the first to the last sample in mm; this or --spacing.")
-    ] = None
-    spacing: Annotated[float | None, Parameter(help="Distance between samples in mm, the same in x and y.")] = None
-    unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
-    std: Annotated[float | None, Parameter(help="Standard deviation of the thickness noise in mm.")] = None
-    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
-    l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
-    smooth: Annotated[
-        float | None,
-        Parameter(help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element."),
-    ] = None
-
-
-@Parameter(name="*", group=Group("Layer", sort_key=2))
-@dataclass(frozen=True)
-class LayerOptions:
-    """The layer and its mesh."""
-
-    c10: Annotated[
-        float | None, Parameter(help=f"Mooney–Rivlin C10 in MPa. Default: the published {PUBLISHED_C10}.")
-    ] = None
-    c01: Annotated[
-        float | None, Parameter(help=f"Mooney–Rivlin C01 in MPa. Default: the published {PUBLISHED_C01}.")
-    ] = None
-    bulk: Annotated[
-        float | None,
-        Parameter(help=f"Bulk modulus in MPa; required with --c10 or --c01. Default: {PUBLISHED_BULK}, K/µ = 20."),
-    ] = None
-    layer_extent: Annotated[
-        tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
-    ] = None
-    elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
-        _ELEMENTS
-    )
-    element: Annotated[
-        Literal["mean_dilatation", "full"], Parameter(help="Element; only the default is free of locking.")
-    ] = "mean_dilatation"
-    sides: Annotated[Literal["free", "roller"], Parameter(help="What the layer's sides meet.")] = "free"
-
-
-@Parameter(name="*", group=Group("Contact", sort_key=3))
-@dataclass(frozen=True)
-class ContactOptions:
-    """Contact with window and sample."""
-
-    window_friction: Annotated[float, Parameter(help="Coulomb friction at the window.")] = 0.15
-    sample_friction: Annotated[float, Parameter(help="Coulomb friction at the sample.")] = 0.05
-    p0: Annotated[float, Parameter(help="Sample contact: pressure at zero clearance in MPa.")] = 2.0
-    c0: Annotated[float, Parameter(help="Sample contact: clearance where pressure starts in mm.")] = 0.01
-    correct_approach: Annotated[
-        bool, Parameter(help="Also shift out the approach of sample and layer that the contact law causes.")
-    ] = False
-
-
-@Parameter(name="*", group=Group("Run", sort_key=4))
-@dataclass(frozen=True)
-class RunOptions:
-    """The run itself."""
-
-    increments: Annotated[int | None, Parameter(help="Load increments. Default: the solver's own.")] = None
-    force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
-    debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
@@ -221,7 +155,13 @@ def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | Thi
     try:
         return loaded, float(options.l0)
     except ValueError:
-        return loaded, read_thickness(options.l0, variable=options.l0_variable, **grid)
+        unloaded = read_thickness(options.l0, variable=options.l0_variable, **grid)
+    if unloaded.shape != loaded.shape:
+        raise ValueError(
+            f"--l0 [pixels] must be on the grid of MAP, {loaded.shape} rows and columns, got {unloaded.shape}. "
+            "Resample one of them; in Python, ThicknessMap takes another extent for each."
+        )
+    return loaded, unloaded
 
 
 def state_experiment(
@@ -272,7 +212,7 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
         out: Folder of the results.
     """
     # Loaded here, so that the help and a refused run do not wait for matplotlib.
-    from .plot import plot_pressure, report_figure
+    from ..plot import plot_pressure, report_figure
 
     dataset = to_xarray(solution)
     figures = {"pressure.png": plot_pressure(dataset).figure, "report.png": report_figure(dataset, measured)}
@@ -336,7 +276,13 @@ def _ready(thickness: ThicknessMap, fwhm: float) -> ThicknessMap:
 
 
 def _layer_extent(measured: ThicknessMap, options: LayerOptions) -> tuple[float, float]:
+    ends = (measured.origin + measured.extent).tolist()
     if options.layer_extent is not None:
+        if any(length > 1.001 * end for length, end in zip(options.layer_extent, ends, strict=True)):
+            raise ValueError(
+                f"--layer-extent [mm] must lie on the map, which ends at x, y = {ends}, got {options.layer_extent}. "
+                "Where nothing was measured there is no stress to compute: make the layer smaller."
+            )
         return options.layer_extent
     if np.any(measured.origin):
         start = measured.origin.tolist()

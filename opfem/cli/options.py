@@ -1,0 +1,81 @@
+"""Options of the command line, in the groups that its help shows."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from cyclopts import Group, Parameter
+
+# The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
+PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
+_ELEMENTS = (40, 40, 4)
+
+
+@Parameter(name="*", group=Group("Map", sort_key=1))
+@dataclass(frozen=True)
+class MapOptions:
+    """How to read the loaded and the unloaded thickness."""
+
+    l0: Annotated[str | None, Parameter(help="Unloaded thickness: a number in mm, or the path of a map.")] = None
+    extent: Annotated[
+        tuple[float, float] | None, Parameter(help="LX LY from the first to the last sample in mm; this or --spacing.")
+    ] = None
+    spacing: Annotated[float | None, Parameter(help="Distance between samples in mm, the same in x and y.")] = None
+    unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
+    std: Annotated[float | None, Parameter(help="Standard deviation of the thickness noise in mm.")] = None
+    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
+    l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
+    smooth: Annotated[
+        float | None,
+        Parameter(help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element."),
+    ] = None
+
+
+@Parameter(name="*", group=Group("Layer", sort_key=2))
+@dataclass(frozen=True)
+class LayerOptions:
+    """The layer and its mesh."""
+
+    c10: Annotated[
+        float | None, Parameter(help=f"Mooney–Rivlin C10 in MPa. Default: the published {PUBLISHED_C10}.")
+    ] = None
+    c01: Annotated[
+        float | None, Parameter(help=f"Mooney–Rivlin C01 in MPa. Default: the published {PUBLISHED_C01}.")
+    ] = None
+    bulk: Annotated[
+        float | None,
+        Parameter(help=f"Bulk modulus in MPa; required with --c10 or --c01. Default: {PUBLISHED_BULK}, K/µ = 20."),
+    ] = None
+    layer_extent: Annotated[
+        tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
+    ] = None
+    elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
+        _ELEMENTS
+    )
+    element: Annotated[
+        Literal["mean_dilatation", "full"], Parameter(help="Element; only the default is free of locking.")
+    ] = "mean_dilatation"
+    sides: Annotated[Literal["free", "roller"], Parameter(help="What the layer's sides meet.")] = "free"
+
+
+@Parameter(name="*", group=Group("Contact", sort_key=3))
+@dataclass(frozen=True)
+class ContactOptions:
+    """Contact with window and sample."""
+
+    window_friction: Annotated[float, Parameter(help="Coulomb friction at the window.")] = 0.15
+    sample_friction: Annotated[float, Parameter(help="Coulomb friction at the sample.")] = 0.05
+    p0: Annotated[float, Parameter(help="Sample contact: pressure at zero clearance in MPa.")] = 2.0
+    c0: Annotated[float, Parameter(help="Sample contact: clearance where pressure starts in mm.")] = 0.01
+    correct_approach: Annotated[
+        bool, Parameter(help="Also shift out the approach of sample and layer that the contact law causes.")
+    ] = False
+
+
+@Parameter(name="*", group=Group("Run", sort_key=4))
+@dataclass(frozen=True)
+class RunOptions:
+    """The run itself."""
+
+    increments: Annotated[int | None, Parameter(help="Load increments. Default: the solver's own.")] = None
+    force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
+    debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False
