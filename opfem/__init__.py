@@ -40,7 +40,7 @@ from .solvers import (
     solve as solve,
 )
 
-_PICTURES = ("plot_layer", "plot_pressure", "plot_residual", "plot_status", "plot_thickness", "report_figure")
+_PICTURES = ("plot_layer", "plot_pressure", "plot_report", "plot_residual", "plot_status", "plot_thickness")
 
 
 def __getattr__(name: str) -> Any:

@@ -6,14 +6,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxtyping
+import matplotlib
 import numpy as np
 import pytest
 
 jaxtyping.install_import_hook("opfem", "beartype.beartype")
 jax.config.update("jax_enable_x64", True)
+matplotlib.use("agg")
 
 # After the hook, which checks only what is imported later.
 import opfem as op  # noqa: E402
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_code_is_released():
+    """XLA maps thousands of memory regions per compiled solve; Linux allows a process 65 530, then jaxlib crashes."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

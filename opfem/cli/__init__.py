@@ -212,10 +212,10 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
         out: Folder of the results.
     """
     # Loaded here, so that the help and a refused run do not wait for matplotlib.
-    from ..plot import plot_pressure, report_figure
+    from ..plot import draw_pictures
 
     dataset = to_xarray(solution)
-    figures = {"pressure.png": plot_pressure(dataset).figure, "report.png": report_figure(dataset, measured)}
+    figures = draw_pictures(dataset, measured)
     _remove(out)
     for name, figure in figures.items():
         with whole_file(out / name) as temporary:

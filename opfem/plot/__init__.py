@@ -1,6 +1,14 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
-from .maps import plot_pressure, plot_residual, plot_status, plot_thickness, report_figure
+from .maps import draw_pictures, plot_pressure, plot_report, plot_residual, plot_status, plot_thickness
 from .scene import plot_layer
 
-__all__ = ["plot_layer", "plot_pressure", "plot_residual", "plot_status", "plot_thickness", "report_figure"]
+__all__ = [
+    "draw_pictures",
+    "plot_layer",
+    "plot_pressure",
+    "plot_report",
+    "plot_residual",
+    "plot_status",
+    "plot_thickness",
+]

@@ -1,8 +1,8 @@
 """Maps of pressure in kPa, thickness in µm and contact status, oriented as MATLAB's imagesc shows them.
 
 Edge of the chain: drawn from `to_xarray` and `ThicknessMap`. Row 0 of a map is at the top, so y grows
-downwards and x to the right; x and y have the same scale. Nothing here touches pyplot: without `ax`
-a picture gets its own `Figure`, found as `ax.figure`, which notebooks show and `savefig` writes.
+downwards and x to the right; x and y have the same scale. Without `ax` a picture is pyplot's, as in
+pandas: notebooks show it by themselves, a script calls `matplotlib.pyplot.show()` or `ax.figure.savefig`.
 """
 
 from typing import Any
@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -23,6 +22,8 @@ from ..results import Solution, to_xarray
 
 _KPA = 1e3
 _UM = 1e3
+_MAP_SIZE = (5.6, 4.6)  # inches
+_REPORT_SIZE = (10.4, 8.4)
 _NO_DATA: dict[str, Any] = {"facecolor": "0.88", "edgecolor": "0.55", "hatch": "////"}
 # Apart in hue for every kind of colour vision, and in lightness for a grey print.
 STATUS_COLOURS = {"open": "#f0f0f0", "stick": "#0072b2", "slip": "#e69f00"}
@@ -133,19 +134,24 @@ def plot_residual(
     return _image(residual, x, y, ax, label, cmap, (-limit, limit))
 
 
-def report_figure(data: Solution | xr.Dataset, measured: ThicknessMap | None = None) -> Figure:
+def plot_report(
+    data: Solution | xr.Dataset, measured: ThicknessMap | None = None, figure: Figure | None = None
+) -> np.ndarray:
     """Draw what a palpation rests on: measured thickness, pressure, contact status, residual of thickness.
 
     Args:
         data: A solution under `Imprint`, or its dataset.
         measured: Measured map on the grid of the solution's load; None takes the map that was pressed in.
+        figure: Empty figure to draw on; None makes one.
+
+    Returns:
+        The four axes, 2 × 2.
 
     Raises:
         ValueError: For a failed solution, or a map on another grid.
     """
     dataset = _converged(data)
-    figure = _figure((10.4, 8.4))
-    axes = figure.subplots(2, 2)
+    axes = (_shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
     x, y = dataset["x_image"].values, dataset["y_image"].values
     measured_um = _UM * _measured_values(dataset, measured)
     _image(measured_um, x, y, axes[0, 0], "Thickness [µm]", "viridis", None)
@@ -159,7 +165,20 @@ def report_figure(data: Solution | xr.Dataset, measured: ThicknessMap | None = N
     axes[0, 1].set_title(f"Pressure at the sample, {force:.3g} N")
     axes[1, 0].set_title("Contact at the sample")
     axes[1, 1].set_title(f"Residual, {rms:.2g} µm rms")
-    return figure
+    return axes
+
+
+def draw_pictures(data: xr.Dataset, measured: ThicknessMap) -> dict[str, Figure]:
+    """Draw the pictures that go with a palpation's files, by file name, without any display.
+
+    Args:
+        data: Dataset of a solution under `Imprint`.
+        measured: Measured map on the grid of the solution's load.
+    """
+    pressure, report = (Figure(figsize=size, layout="compressed") for size in (_MAP_SIZE, _REPORT_SIZE))
+    plot_pressure(data, pressure.subplots())
+    plot_report(data, measured, report)
+    return {"pressure.png": pressure, "report.png": report}
 
 
 def _converged(data: Solution | xr.Dataset) -> xr.Dataset:
@@ -210,14 +229,16 @@ def _image(
     return ax
 
 
-def _figure(size: tuple[float, float]) -> Figure:
-    figure = Figure(figsize=size, layout="compressed")
-    FigureCanvasAgg(figure)
-    return figure
+def _shown_figure(size: tuple[float, float]) -> Figure:
+    """Make a figure that notebooks show by themselves."""
+    # Loaded here, so that writing a file never starts a display.
+    import matplotlib.pyplot as plt
+
+    return plt.figure(figsize=size, layout="compressed")
 
 
 def _axes(ax: Axes | None) -> Axes:
-    return _figure((5.6, 4.6)).subplots() if ax is None else ax
+    return _shown_figure(_MAP_SIZE).subplots() if ax is None else ax
 
 
 def _colour_bar(ax: Axes, colours: ScalarMappable, label: str, extend: str) -> Colorbar:

@@ -4,13 +4,14 @@ import subprocess
 import sys
 from io import BytesIO
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 import opfem as op
-from opfem.plot import plot_pressure, plot_residual, plot_status, plot_thickness, report_figure
+from opfem.plot import draw_pictures, plot_pressure, plot_residual, plot_status, plot_thickness
 from opfem.plot.maps import STATUS_COLOURS
 from tests import tolerances as tol
 
@@ -39,6 +40,12 @@ def pictures(dataset, loaded):
         "thickness": plot_thickness(loaded),
         "residual": plot_residual(dataset, loaded),
     }
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
 
 
 NAMES = ["pressure", "window", "status", "thickness", "residual"]
@@ -133,7 +140,9 @@ def test_residual_needs_the_same_grid(dataset):
 
 
 def test_report(dataset, loaded):
-    figure = report_figure(dataset, loaded)
+    drawn = draw_pictures(dataset, loaded)
+    assert list(drawn) == ["pressure.png", "report.png"]
+    figure = drawn["report.png"]
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
     force = -float(dataset.force_sample[2])
     assert titles[:3] == ["Measured thickness", f"Pressure at the sample, {force:.3g} N", "Contact at the sample"]
@@ -148,6 +157,13 @@ def test_report(dataset, loaded):
 def test_failed_solution_is_not_drawn(failed_solution):
     with pytest.raises(ValueError, match="did not converge"):
         plot_pressure(failed_solution)
+
+
+def test_notebooks_show_pictures_and_files_need_no_display(dataset, loaded):
+    draw_pictures(dataset, loaded)
+    assert plt.get_fignums() == []
+    ax = plot_pressure(dataset)
+    assert plt.gcf() is ax.figure
 
 
 def test_no_pyplot():

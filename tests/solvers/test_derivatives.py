@@ -31,13 +31,14 @@ def bump(n: int, depth: float = 0.08) -> np.ndarray:
 def measure(solution: op.Solution) -> jax.Array:
     """Weigh every kind of output into one number of order one; no two nodes count the same."""
     total = jnp.zeros(())
+    rim = solution.thickness.shape[0] // 8  # pixels there may leave the layer, all at once
     outputs = {
         "pressure": 1e3 * solution.pressure,
         "window": 1e3 * solution.window.pressure,
         "traction": 1e3 * solution.traction,
         "stress": 1e3 * solution.stress_zz,
         "slip": 10.0 * solution.slip,
-        "thickness": 10.0 * jnp.where(solution.thickness.mask, 0.0, solution.thickness.values),
+        "thickness": 10.0 * solution.thickness.values[rim : -rim or None, rim : -rim or None],
         "energy": 1e3 * solution.stats["strain_energy"],
         "dissipation": 1e3 * solution.stats["friction_dissipation"],
         "approach": 1e3 * solution.stats["approach"],
