@@ -22,14 +22,18 @@ from .model import (
     Displacement as Displacement,
     ExponentialOverclosure as ExponentialOverclosure,
     HardOverclosure as HardOverclosure,
+    Hencky as Hencky,
     Imprint as Imprint,
     Layer as Layer,
     LinearOverclosure as LinearOverclosure,
     MooneyRivlin as MooneyRivlin,
     NeoHooke as NeoHooke,
+    Ogden as Ogden,
     Palpation as Palpation,
     Roller as Roller,
+    TabularOverclosure as TabularOverclosure,
     Traction as Traction,
+    Yeoh as Yeoh,
 )
 from .results import summary as summary, to_xarray as to_xarray
 from .solvers import (

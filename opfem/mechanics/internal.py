@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..model import LayerMesh
-from ..model.material import AbstractMaterial, Kinematics, kinematics, outer
+from ..model import AbstractMaterial, LayerMesh
+from ..model.deformation import Kinematics, kinematics, outer
 from .hex8 import GRADIENTS, assemble, gather
 from .kinematics import ElementGeometry, contract, displacement_gradient, element_geometry
 

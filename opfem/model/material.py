@@ -1,8 +1,7 @@
-"""Hyperelastic materials of the layer, written for the deformation gradient F = I + H.
+"""Hyperelastic materials of the layer: an isochoric energy plus U(J) = (bulk/2)(J-1)².
 
-Each law is an isochoric energy of the modified invariants plus U(J) = (bulk/2)(J-1)². Stress
-and tangent are closed forms; `energy` is the oracle that tests differentiate. The fields carry
-leading (3, 3) axes and any trailing shape, so one law serves every mesh.
+Stress and tangent are closed forms; `energy` is the oracle that tests differentiate. Here are the laws
+in the modified invariants; those in principal stretches are in `stretch_material`.
 """
 
 import equinox as eqx
@@ -10,76 +9,31 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_finite, check_positive
-
-Tensor = Float[Array, "3 3 *points"]
-
-
-class Kinematics(eqx.Module):
-    """Quantities of one deformation gradient that stress and tangent share.
-
-    Attributes:
-        F: Deformation gradient [-].
-        C: Right Cauchy–Green tensor [-].
-        G: Inverse transpose of F [-].
-        volume_change: J - 1 [-], computed without cancellation.
-        I1: First invariant of C [-].
-        I2: Second invariant of C [-].
-    """
-
-    F: Tensor
-    C: Tensor
-    G: Tensor
-    volume_change: Float[Array, "*points"]
-    I1: Float[Array, "*points"]
-    I2: Float[Array, "*points"]
-
-    @property
-    def J(self) -> Float[Array, "*points"]:
-        """Volume ratio [-]."""
-        return 1.0 + self.volume_change
-
-
-def kinematics(H: Tensor) -> Kinematics:
-    """Compute what a law needs from the displacement gradient H [-]."""
-    F = H + identity_like(H)
-    cof = cofactor(F)
-    trace = H[0, 0] + H[1, 1] + H[2, 2]
-    minors = cofactor(H)
-    determinant = sum(H[0, k] * minors[0, k] for k in range(3))
-    # J - 1 from H: near-incompressible stress is bulk times this small number.
-    change = trace + minors[0, 0] + minors[1, 1] + minors[2, 2] + determinant
-    C = product(transpose(F), F)
-    I1 = C[0, 0] + C[1, 1] + C[2, 2]
-    C_minors = cofactor(C)
-    I2 = C_minors[0, 0] + C_minors[1, 1] + C_minors[2, 2]
-    return Kinematics(F=F, C=C, G=cof / (1.0 + change), volume_change=change, I1=I1, I2=I2)
+from .deformation import Kinematics, Tensor, identity_like, kinematics, outer, product, transpose
 
 
 class AbstractMaterial(eqx.Module):
-    """A law whose isochoric energy is linear in the modified invariants, plus U(J)."""
+    """An isotropic law; `bulk` and `shear` are its initial moduli [MPa]."""
 
     bulk: eqx.AbstractVar[Array]
+    shear: eqx.AbstractVar[Array]
 
-    @property
-    def shear(self) -> Array:
-        """Initial shear modulus [MPa]."""
-        c10, c01 = self.coefficients()
-        return 2.0 * (c10 + c01)
+    def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
+        """Compute the isochoric part of the energy density [MPa]."""
+        raise NotImplementedError
 
-    def coefficients(self) -> tuple[Array, Array]:
-        """Return dψ/dĪ1 and dψ/dĪ2 [MPa]."""
+    def isochoric_piola(self, k: Kinematics) -> Tensor:
+        """Compute the isochoric part of the first Piola–Kirchhoff stress [MPa]."""
+        raise NotImplementedError
+
+    def isochoric_tangent(self, k: Kinematics) -> Float[Array, "3 3 3 3 *points"]:
+        """Compute the derivative of `isochoric_piola` by F [MPa]: A[i, J, k, L] = dP[i, J]/dF[k, L]."""
         raise NotImplementedError
 
     def energy(self, H: Tensor) -> Float[Array, "*points"]:
         """Compute the strain-energy density [MPa] per reference volume."""
         k = kinematics(H)
         return self.isochoric_energy(k) + self.volumetric_energy(k.volume_change)
-
-    def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
-        """Compute the isochoric part of the energy density [MPa]."""
-        c10, c01 = self.coefficients()
-        j = k.J ** (-2.0 / 3.0)
-        return c10 * (j * k.I1 - 3.0) + c01 * (j * j * k.I2 - 3.0)
 
     def volumetric_energy(self, volume_change: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Compute U(J) [MPa] from J - 1."""
@@ -95,12 +49,8 @@ class AbstractMaterial(eqx.Module):
         Args:
             k: Kinematics of the point.
             mean_stress: dU/dJ [MPa]; of the point itself, or of its element's mean dilatation.
-
-        Source:
-            Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, ch. 6.
         """
-        a, b, D, pull = self._terms(k)
-        return 2.0 * (a * k.F + b * D) + (mean_stress * k.J - pull) * k.G
+        return self.isochoric_piola(k) + (mean_stress * k.J) * k.G
 
     def tangent(self, k: Kinematics, mean_stress: Array) -> Float[Array, "3 3 3 3 *points"]:
         """Compute A[i, J, k, L] = dP[i, J]/dF[k, L] [MPa] at constant dU/dJ.
@@ -108,15 +58,44 @@ class AbstractMaterial(eqx.Module):
         The stiffness of U itself, U'' cof F ⊗ cof F, is left to the element form: it acts on
         the point's volume or on the element's.
         """
+        return self.isochoric_tangent(k) + (mean_stress * k.J) * (outer(k.G, k.G) - _crossed(k.G))
+
+
+class AbstractInvariantMaterial(AbstractMaterial):
+    """A law in the modified invariants Ī1 = J^(-2/3) I1 and Ī2 = J^(-4/3) I2, linear in Ī2.
+
+    Source:
+        Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, ch. 6.
+    """
+
+    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+        """Return dψ/dĪ1 and dψ/dĪ2 [MPa] at Ī1 - 3."""
+        raise NotImplementedError
+
+    def curvature(self, I1_change: Array) -> Array | None:
+        """Return d²ψ/dĪ1² [MPa] at Ī1 - 3; None where it is zero for any stretch."""
+        return None
+
+    @property
+    def shear(self) -> Array:
+        """Initial shear modulus [MPa]."""
+        a, b = self.slopes(jnp.zeros_like(self.bulk))
+        return 2.0 * (a + b)
+
+    def isochoric_piola(self, k: Kinematics) -> Tensor:
+        """Compute the isochoric part of the first Piola–Kirchhoff stress [MPa]."""
+        a, b, D, pull = self._terms(k)
+        return 2.0 * (a * k.F + b * D) - pull * k.G
+
+    def isochoric_tangent(self, k: Kinematics) -> Float[Array, "3 3 3 3 *points"]:
+        """Compute the derivative of `isochoric_piola` by F [MPa]."""
         a, b, D, pull = self._terms(k)
         eye = identity_like(k.F)
         F, G, C = k.F, k.G, k.C
         B = product(F, transpose(F))
         same = eye[:, None, :, None] * eye[None, :, None, :]
-        crossed = G[:, None, None, :] * transpose(G)[None, :, :, None]
         stretch = 4.0 / 3.0 * (a * F + 2.0 * b * D)
-        volume = 4.0 / 9.0 * (a * k.I1 + 4.0 * b * k.I2) + mean_stress * k.J
-        return (
+        tangent = (
             (2.0 * (a + b * k.I1)) * same
             + (4.0 * b) * outer(F, F)
             - (2.0 * b) * (eye[:, None, :, None] * C[None, :, None, :])
@@ -124,19 +103,25 @@ class AbstractMaterial(eqx.Module):
             - (2.0 * b) * (B[:, None, :, None] * eye[None, :, None, :])
             - outer(stretch, G)
             - outer(G, stretch)
-            + volume * outer(G, G)
-            + (pull - mean_stress * k.J) * crossed
+            + (4.0 / 9.0 * (a * k.I1 + 4.0 * b * k.I2)) * outer(G, G)
+            + pull * _crossed(G)
         )
+        j = k.J ** (-2.0 / 3.0)
+        curvature = self.curvature(j * k.I1 - 3.0)
+        if curvature is None:
+            return tangent
+        slope = (2.0 * j) * (F - (k.I1 / 3.0) * G)  # dĪ1/dF
+        return tangent + curvature * outer(slope, slope)
 
     def _terms(self, k: Kinematics) -> tuple[Array, Array, Tensor, Array]:
-        c10, c01 = self.coefficients()
         j = k.J ** (-2.0 / 3.0)
-        a, b = c10 * j, c01 * j * j
+        by_I1, by_I2 = self.slopes(j * k.I1 - 3.0)
+        a, b = by_I1 * j, by_I2 * j * j
         D = k.I1 * k.F - product(k.F, k.C)
         return a, b, D, 2.0 / 3.0 * (a * k.I1 + 2.0 * b * k.I2)
 
 
-class MooneyRivlin(AbstractMaterial):
+class MooneyRivlin(AbstractInvariantMaterial):
     """Mooney–Rivlin: ψ = c10 (Ī1 - 3) + c01 (Ī2 - 3) + (bulk/2)(J - 1)².
 
     Ī1 = J^(-2/3) I1 and Ī2 = J^(-4/3) I2. Abaqus: *HYPERELASTIC, MOONEY-RIVLIN with C10, C01
@@ -162,12 +147,17 @@ class MooneyRivlin(AbstractMaterial):
         check_positive("MooneyRivlin shear modulus 2 (c10 + c01)", "MPa", 2.0 * (self.c10 + self.c01))
         check_positive("MooneyRivlin.bulk", "MPa", self.bulk)
 
-    def coefficients(self) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
         """Return c10 and c01 [MPa]."""
         return self.c10, self.c01
 
+    def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
+        """Compute the isochoric part of the energy density [MPa]."""
+        j = k.J ** (-2.0 / 3.0)
+        return self.c10 * (j * k.I1 - 3.0) + self.c01 * (j * j * k.I2 - 3.0)
 
-class NeoHooke(AbstractMaterial):
+
+class NeoHooke(AbstractInvariantMaterial):
     """Neo-Hooke: ψ = (shear/2)(Ī1 - 3) + (bulk/2)(J - 1)², with Ī1 = J^(-2/3) I1.
 
     Abaqus: *HYPERELASTIC, NEO HOOKE with C10 = shear/2 and D1 = 2/bulk.
@@ -187,39 +177,55 @@ class NeoHooke(AbstractMaterial):
         check_positive("NeoHooke.c10", "MPa", self.c10)
         check_positive("NeoHooke.bulk", "MPa", self.bulk)
 
-    def coefficients(self) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
         """Return c10 and zero [MPa]."""
         return self.c10, jnp.zeros_like(self.c10)
 
-
-def identity_like(F: Tensor) -> Array:
-    """Build the identity with trailing axes of size one."""
-    return jnp.eye(3, dtype=F.dtype).reshape((3, 3) + (1,) * (F.ndim - 2))
-
-
-def transpose(A: Tensor) -> Tensor:
-    """Swap the two tensor axes."""
-    return jnp.swapaxes(A, 0, 1)
+    def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
+        """Compute the isochoric part of the energy density [MPa]."""
+        return self.c10 * (k.J ** (-2.0 / 3.0) * k.I1 - 3.0)
 
 
-def product(A: Tensor, B: Tensor) -> Tensor:
-    """Multiply two fields of 3×3 matrices, point by point."""
-    return A[:, 0, None] * B[None, 0] + A[:, 1, None] * B[None, 1] + A[:, 2, None] * B[None, 2]
+class Yeoh(AbstractInvariantMaterial):
+    """Yeoh: ψ = c10 (Ī1 - 3) + c20 (Ī1 - 3)² + c30 (Ī1 - 3)³ + (bulk/2)(J - 1)².
+
+    Abaqus: *HYPERELASTIC, YEOH with C10, C20, C30, D1 = 2/bulk and D2 = D3 = 0. Initial shear modulus 2 c10.
+
+    Args:
+        c10: Coefficient of Ī1 - 3 [MPa], positive.
+        c20: Coefficient of its square [MPa], often negative.
+        c30: Coefficient of its cube [MPa].
+        bulk: Bulk modulus [MPa], positive.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+
+    c10: Array = eqx.field(converter=as_leaf)
+    c20: Array = eqx.field(converter=as_leaf)
+    c30: Array = eqx.field(converter=as_leaf)
+    bulk: Array = eqx.field(converter=as_leaf)
+
+    def __check_init__(self):
+        check_positive("Yeoh.c10", "MPa", self.c10)
+        check_finite("Yeoh.c20", "MPa", self.c20)
+        check_finite("Yeoh.c30", "MPa", self.c30)
+        check_positive("Yeoh.bulk", "MPa", self.bulk)
+
+    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+        """Return dψ/dĪ1 and zero [MPa] at Ī1 - 3."""
+        return self.c10 + (2.0 * self.c20 + 3.0 * self.c30 * I1_change) * I1_change, jnp.zeros_like(self.c10)
+
+    def curvature(self, I1_change: Array) -> Array:
+        """Return d²ψ/dĪ1² [MPa] at Ī1 - 3."""
+        return 2.0 * self.c20 + 6.0 * self.c30 * I1_change
+
+    def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
+        """Compute the isochoric part of the energy density [MPa]."""
+        x = k.J ** (-2.0 / 3.0) * k.I1 - 3.0
+        return ((self.c30 * x + self.c20) * x + self.c10) * x
 
 
-def outer(A: Tensor, B: Tensor) -> Float[Array, "3 3 3 3 *points"]:
-    """Form A[i, J] B[k, L]."""
-    return A[:, :, None, None] * B[None, None]
-
-
-def cofactor(A: Tensor) -> Tensor:
-    """Compute the cofactor matrix, det(A) A^(-T)."""
-    rows = [
-        [
-            A[(i + 1) % 3, (j + 1) % 3] * A[(i + 2) % 3, (j + 2) % 3]
-            - A[(i + 1) % 3, (j + 2) % 3] * A[(i + 2) % 3, (j + 1) % 3]
-            for j in range(3)
-        ]
-        for i in range(3)
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+def _crossed(G: Tensor) -> Float[Array, "3 3 3 3 *points"]:
+    """Form G[i, L] G[k, J], minus the derivative of G by F."""
+    return G[:, None, None, :] * transpose(G)[None, :, :, None]

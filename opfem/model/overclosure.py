@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_positive
+from .._checks import as_leaf, check_finite, check_positive, concrete
 
 # Overclosure, in units of c0, beyond which the exponential law continues along its tangent;
 # the same threshold as Abaqus (Theory Guide 5.2.1). At p0 = 2 MPa it is 1.3 GPa.
@@ -153,3 +153,65 @@ class ExponentialOverclosure(AbstractOverclosure):
     def zero_pressure_clearance(self) -> Array:
         """Clearance at which pressure starts [mm]."""
         return self.c0
+
+
+class TabularOverclosure(AbstractOverclosure):
+    """Contact by a table, linear between its rows; beyond the last row it continues along the last segment.
+
+    Abaqus: *SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=TABULAR, whose second column is minus the clearance.
+
+    Args:
+        pressure: Pressures [MPa], `(rows,)`, rising from 0.
+        clearance: Clearances [mm] of the same rows, falling.
+
+    Raises:
+        ValueError: If the table has fewer than two rows, or does not rise and fall.
+    """
+
+    pressures: Array
+    clearances: Array
+
+    def __init__(self, pressure, clearance):
+        self.pressures = as_leaf(pressure)
+        self.clearances = as_leaf(clearance)
+        if self.pressures.ndim != 1 or self.pressures.shape != self.clearances.shape or self.pressures.size < 2:
+            raise ValueError(
+                "TabularOverclosure.pressure [MPa] and .clearance [mm] must be two lists of one length, at least 2, "
+                f"got shapes {self.pressures.shape} and {self.clearances.shape}."
+            )
+        check_finite("TabularOverclosure.pressure", "MPa", self.pressures)
+        check_finite("TabularOverclosure.clearance", "mm", self.clearances)
+        pressures, clearances = concrete(self.pressures), concrete(self.clearances)
+        if pressures is not None and (pressures[0] != 0.0 or (np.diff(pressures) <= 0).any()):
+            raise ValueError(f"TabularOverclosure.pressure [MPa] must rise from 0, got {pressures.tolist()}.")
+        if clearances is not None and (np.diff(clearances) >= 0).any():
+            raise ValueError(
+                f"TabularOverclosure.clearance [mm] must fall from row to row, got {clearances.tolist()}. "
+                "Overclosure is minus the clearance."
+            )
+
+    def pressure(self, clearance: Array, scale: Array) -> Array:
+        """Compute the contact pressure [MPa]."""
+        return _along(-clearance, -self.clearances, self.pressures)
+
+    def clearance(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] of a pressure."""
+        return self.clearances[0] - _along(pressure, self.pressures, self.clearances[0] - self.clearances)
+
+    @property
+    def zero_pressure_clearance(self) -> Array:
+        """Clearance at which pressure starts [mm]."""
+        return self.clearances[0]
+
+
+def _along(x: Array, rows: Array, values: Array) -> Array:
+    """Interpolate rising `values` over rising `rows`: 0 before the first row, straight on after the last."""
+    total = jnp.zeros_like(x)
+    for k in range(rows.size - 1):
+        inside = x - rows[k]
+        if k < rows.size - 2:
+            inside = jnp.where(x < rows[k + 1], inside, rows[k + 1] - rows[k])
+        slope = (values[k + 1] - values[k]) / (rows[k + 1] - rows[k])
+        # As everywhere: a point that just touches is held.
+        total = total + jnp.where(x >= rows[k], slope * inside, 0.0)
+    return total

@@ -11,8 +11,11 @@ from tests.tolerances import FINITE_DIFFERENCE, ROUNDOFF
 P0, C0 = 2.0, 0.01
 LAW = op.ExponentialOverclosure(pressure=P0, clearance=C0)
 SCALE = jnp.asarray(0.5)
+TABLE = op.TabularOverclosure(pressure=[0.0, 0.01, 0.5, 0.6], clearance=[0.009, 0.002, -0.001, -0.02])
 ALL_LAWS = pytest.mark.parametrize(
-    "law", [op.HardOverclosure(), op.LinearOverclosure(7.0), LAW], ids=["hard", "linear", "exponential"]
+    "law",
+    [op.HardOverclosure(), op.LinearOverclosure(7.0), LAW, TABLE],
+    ids=["hard", "linear", "exponential", "tabular"],
 )
 EPS = np.finfo(float).eps
 # Overclosure, in units of c0, where the docstring says that the tangent takes over.
@@ -103,22 +106,33 @@ def test_linear_and_hard_laws_are_lines():
     assert op.LinearOverclosure(7.0).zero_pressure_clearance == 0.0
 
 
-@pytest.mark.parametrize("law", [op.HardOverclosure(), op.LinearOverclosure(7.0)], ids=["hard", "linear"])
+def test_tabular_law_passes_through_its_rows_and_goes_straight_on():
+    rows = np.column_stack([TABLE.clearances, TABLE.pressures])
+    between = 0.5 * (rows[1:] + rows[:-1])
+    beyond = rows[-1] + 10 * (rows[-1] - rows[-2])
+    points = np.vstack([[[1.0, 0.0]], rows, between, beyond])
+    np.testing.assert_allclose(TABLE.pressure(jnp.asarray(points[:, 0]), SCALE), points[:, 1], ROUNDOFF, 1e-16)
+    np.testing.assert_allclose(TABLE.clearance(jnp.asarray(points[1:, 1]), SCALE), points[1:, 0], ROUNDOFF, 1e-16)
+
+
+@pytest.mark.parametrize(
+    "law", [op.HardOverclosure(), op.LinearOverclosure(7.0), TABLE], ids=["hard", "linear", "table"]
+)
 def test_a_point_that_just_touches_is_held(law):
-    p, slope = pressure_and_slope(law, 0.0)
+    touching = law.zero_pressure_clearance
+    p, slope = pressure_and_slope(law, touching)
     assert p == 0.0
-    assert slope == pressure_and_slope(law, -1e-3)[1]
+    np.testing.assert_allclose(slope, pressure_and_slope(law, touching - 1e-3)[1], ROUNDOFF)
 
 
 @ALL_LAWS
 def test_clearance_is_the_inverse_of_pressure_over_twelve_decades(law):
     p = P0 * np.logspace(-8, 4, 97)
     clearance = law.clearance(jnp.asarray(p), SCALE)
-    # Near c0 a clearance has lost the digits of s = 1 - g/c0, the distance that makes pressure.
-    lost = 4 * EPS / np.sqrt(p * (np.e - 1) / P0) if law is LAW else 0.0
-    np.testing.assert_allclose(law.pressure(clearance, SCALE) / p, 1.0, rtol=0, atol=np.max(ROUNDOFF + lost))
-    error = np.abs(np.asarray(law.pressure(clearance, SCALE)) / p - 1)
-    assert np.all(error <= ROUNDOFF + lost)
+    got, slope = pressure_and_slope(law, clearance)
+    # Near its start a law has lost the digits of the distance from there, which makes its pressure.
+    lost = 4 * EPS * np.abs(clearance * slope) / p
+    assert np.all(np.abs(got / p - 1) <= ROUNDOFF + lost)
 
 
 def test_clearance_of_the_exponential_law_at_ten_kpa():
@@ -153,6 +167,19 @@ def test_jit_equals_eager_and_vmap_a_loop(law):
         (lambda: op.LinearOverclosure(np.nan), r"LinearOverclosure\.stiffness \[MPa/mm\] must be positive, got nan\."),
         (lambda: op.ExponentialOverclosure(0.0, 0.01), r"pressure \(p0\) \[MPa\] must be positive, got 0\.0\."),
         (lambda: op.ExponentialOverclosure(2.0, -0.01), r"clearance \(c0\) \[mm\] must be positive, got -0\.01\."),
+        (
+            lambda: op.TabularOverclosure([0.0], [0.0]),
+            r"two lists of one length, at least 2, got shapes \(1,\)",
+        ),
+        (
+            lambda: op.TabularOverclosure([0.1, 0.2], [0.0, -0.1]),
+            r"pressure \[MPa\] must rise from 0, got \[0\.1, 0\.2\]\.",
+        ),
+        (
+            lambda: op.TabularOverclosure([0.0, 0.2], [0.0, 0.1]),
+            r"clearance \[mm\] must fall .*got \[0\.0, 0\.1\]\. Overcl",
+        ),
+        (lambda: op.TabularOverclosure([0.0, np.nan], [0.0, -0.1]), r"pressure \[MPa\] must be finite"),
         (lambda: op.ExponentialOverclosure("2", 0.01), r"pressure \(p0\) \[MPa\] must be a number, got '2'\."),
     ],
 )

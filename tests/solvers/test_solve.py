@@ -13,10 +13,10 @@ HARD, EXPONENTIAL = op.HardOverclosure(), op.ExponentialOverclosure(2.0, 0.01)
 SIZE = (2.0, 2.0)
 
 
-def palpation(window=0.15, sample=0.05, **options) -> op.Palpation:
+def palpation(window=0.15, sample=0.05, material=MATERIAL, **options) -> op.Palpation:
     options = {"elements": (8, 8, 2), **options}
     return op.Palpation(
-        op.Layer(0.5, MATERIAL),
+        op.Layer(0.5, material),
         SIZE,
         window=op.Contact(HARD, window),
         sample=op.Contact(EXPONENTIAL, sample),
@@ -81,6 +81,12 @@ def test_two_runs_give_identical_bits(frictional):
 def test_jit_equals_eager(frictional):
     solved = jax.jit(lambda p, m: op.solve(p, op.Imprint(m), throw=False).pressure)(palpation(), bumpy())
     np.testing.assert_allclose(solved, frictional.pressure, rtol=SOLVER, atol=1e-9)
+
+
+def test_ogden_with_exponents_2_and_minus_2_is_mooney_rivlin(frictional):
+    ogden = op.Ogden(mu=[2 * 2.2e-3, 2 * 7.03e-4], alpha=[2.0, -2.0], bulk=0.11612)
+    solved = op.solve(palpation(material=ogden), op.Imprint(bumpy()))
+    np.testing.assert_allclose(solved.pressure, frictional.pressure, rtol=SOLVER, atol=1e-9)
 
 
 def test_vmap_equals_loop():
