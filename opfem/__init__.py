@@ -35,7 +35,7 @@ from .model import (
     Traction as Traction,
     Yeoh as Yeoh,
 )
-from .results import summary as summary, to_xarray as to_xarray
+from .results import layer_fields as layer_fields, summary as summary, to_xarray as to_xarray
 from .solvers import (
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,

@@ -23,7 +23,8 @@ def layer_grid(dataset: xr.Dataset) -> "pyvista.UnstructuredGrid":
     """Build the deformed layer as a pyvista grid of hexahedra.
 
     Points lie where the nodes are after loading [mm]. Array names end in their unit. What acts on a face
-    is NaN (status: -1) at points off that face, `stress_zz_MPa` in cells below the top ones.
+    is NaN (status: -1) at points off that face, `stress_zz_MPa` in cells below the top ones. Stress, strain
+    and energy inside the layer come with a dataset of `to_xarray(solution, interior=True)`.
 
     Args:
         dataset: What `to_xarray` returned.
@@ -107,6 +108,10 @@ def _reference(dataset: xr.Dataset) -> Float[np.ndarray, "3 nz ny nx"]:
 
 def _point_arrays(dataset: xr.Dataset, displacement: np.ndarray) -> dict[str, np.ndarray]:
     arrays = {"displacement_mm": displacement.reshape(3, -1).T}
+    if "stress" in dataset:
+        arrays["stress_MPa"] = dataset["stress"].values.reshape(9, -1).T
+        arrays["green_strain"] = dataset["green_strain"].values.reshape(9, -1).T
+        arrays["energy_density_MPa"] = dataset["energy_density"].values.ravel()
     nodes = displacement.shape[1]
     for prefix, top in (("", True), ("window_", False)):
         pressure, traction = dataset[f"{prefix}pressure"].values, dataset[f"{prefix}traction"].values

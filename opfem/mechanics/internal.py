@@ -34,9 +34,7 @@ class LayerBody(eqx.Module):
     def energy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, ""]:
         """Compute the strain energy [N mm]."""
         k = kinematics(displacement_gradient(self.geometry, gather(u)))
-        change = self._volume_change(k)
-        density = self.material.isochoric_energy(k) + self.material.volumetric_energy(change)
-        return jnp.sum(density * self.geometry.weight)
+        return jnp.sum(self._energy_density(k) * self.geometry.weight)
 
     def internal_force(self, u: Float[Array, "3 mz my mx"]) -> tuple[Float[Array, "3 mz my mx"], Array]:
         """Compute dEnergy/du [N] and the smallest J of any Gauss point."""
@@ -91,9 +89,19 @@ class LayerBody(eqx.Module):
 
     def cauchy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "3 3 8 nz ny nx"]:
         """Compute Cauchy stress [MPa] at the Gauss points, tension positive."""
+        return self._cauchy(kinematics(displacement_gradient(self.geometry, gather(u))))
+
+    def fields(self, u: Float[Array, "3 mz my mx"]) -> tuple[Array, Array, Float[Array, "8 nz ny nx"]]:
+        """Compute F [-], Cauchy stress [MPa] and energy per reference volume [MPa] at the Gauss points."""
         k = kinematics(displacement_gradient(self.geometry, gather(u)))
+        return k.F, self._cauchy(k), self._energy_density(k)
+
+    def _cauchy(self, k: Kinematics) -> Float[Array, "3 3 8 nz ny nx"]:
         P = self.material.first_piola(k, self.material.volumetric_stress(self._volume_change(k)))
         return sum(P[:, j, None] * k.F[None, :, j] for j in range(3)) / k.J
+
+    def _energy_density(self, k: Kinematics) -> Float[Array, "8 nz ny nx"]:
+        return self.material.isochoric_energy(k) + self.material.volumetric_energy(self._volume_change(k))
 
 
 # dN_a/dξ_α with points first: `(8 a, 8 q · 3 α)`.

@@ -2,6 +2,7 @@
 
 from ..solvers import Solution
 from .dataset import to_xarray
+from .interior import LayerFields, layer_fields
 from .summary import summary, summary_rows
 
-__all__ = ["Solution", "summary", "summary_rows", "to_xarray"]
+__all__ = ["LayerFields", "Solution", "layer_fields", "summary", "summary_rows", "to_xarray"]

@@ -15,6 +15,7 @@ from .._checks import concrete
 from ..model import Imprint
 from ..solvers import RESULTS, FaceResult, Solution
 from .fields import under_pixels
+from .interior import layer_fields
 from .provenance import describe, inputs_hash, steps_as_json, versions
 
 NODES = ("y", "x")
@@ -41,7 +42,7 @@ _STATS = {
 Variable = tuple[tuple[str, ...], Any, dict[str, Any]]
 
 
-def to_xarray(solution: Solution) -> xr.Dataset:
+def to_xarray(solution: Solution, *, interior: bool = False) -> xr.Dataset:
     """Label a solution: dims, positions, units, and how it was made.
 
     Everything is in mm, N and MPa. Interface nodes are `y`, `x`; `x_current` and `y_current` say where
@@ -50,6 +51,8 @@ def to_xarray(solution: Solution) -> xr.Dataset:
 
     Args:
         solution: One solution, outside jit.
+        interior: Also take `stress`, `green_strain` and `energy_density` at every node, as `layer_fields`
+            recovers them.
 
     Raises:
         ValueError: For a traced or a batched solution.
@@ -69,8 +72,12 @@ def to_xarray(solution: Solution) -> xr.Dataset:
         **_face("window_", "at the window", solution.window, failed),
         **_image(solution),
         **_stats(solution.stats),
+        **(_interior(solution) if interior else {}),
     }
-    return xr.Dataset(variables, coords=_coordinates(solution), attrs=_record(solution))
+    coordinates = _coordinates(solution)
+    if interior:
+        coordinates["direction"] = (("direction",), np.array(["x", "y", "z"]), {"long_name": "direction of a face"})
+    return xr.Dataset(variables, coords=coordinates, attrs=_record(solution))
 
 
 def status_name(solution: Solution) -> str:
@@ -129,6 +136,18 @@ def _volume(solution: Solution) -> dict[str, Variable]:
             solution.stress_zz,
             "MPa",
             "Cauchy stress zz, mean over the top element, tension positive",
+        ),
+    }
+
+
+def _interior(solution: Solution) -> dict[str, Variable]:
+    fields = layer_fields(solution)
+    tensor = ("component", "direction", "z", *NODES)
+    return {
+        "stress": _variable(tensor, fields.at_nodes(fields.stress), "MPa", "Cauchy stress, tension positive"),
+        "green_strain": _variable(tensor, fields.at_nodes(fields.green_strain), "1", "Green–Lagrange strain"),
+        "energy_density": _variable(
+            ("z", *NODES), fields.at_nodes(fields.energy_density), "MPa", "strain energy per reference volume"
         ),
     }
 

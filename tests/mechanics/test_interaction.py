@@ -381,7 +381,7 @@ def bilinear_hysteresis(path):
 
 @SIDES
 @pytest.mark.parametrize("given", [{"stick_slope": 100.0}, {"elastic_slip": 0.03}], ids=["stick_slope", "elastic_slip"])
-def test_coulomb_block_under_cyclic_slip(above, given):
+def test_27_coulomb_block_under_cyclic_slip(above, given):
     face = coulomb_block(above, **given)
     quarter = np.linspace(0, 0.2, 21)
     cycle = np.concatenate([quarter[-2::-1], -quarter[1:], -quarter[-2::-1], quarter[1:]])

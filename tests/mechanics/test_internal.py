@@ -117,7 +117,7 @@ def test_force_is_the_derivative_of_energy(form, deformed):
 
 
 @FORMS
-def test_stiffness_is_the_derivative_of_force(form, deformed):
+def test_05_stiffness_is_the_derivative_of_force(form, deformed):
     _, body = warped_body(form)
     u = jnp.array(deformed)
     size = u.size
@@ -156,7 +156,7 @@ def test_rigid_motion_causes_no_force(form):
 
 
 @FORMS
-def test_rigid_motion_rotates_the_forces_of_a_deformed_state(form, deformed):
+def test_01_rigid_motion_rotates_the_forces_of_a_deformed_state(form, deformed):
     mesh, body = warped_body(form)
     rng = np.random.default_rng(2)
     Q, shift = random_rotation(rng), rng.standard_normal(3)
@@ -182,7 +182,7 @@ PATCH_F = EYE + 0.2 * np.random.default_rng(3).uniform(-1, 1, (3, 3))
 
 
 @FORMS
-def test_patch_of_an_affine_displacement_has_uniform_stress(form):
+def test_03_patch_of_an_affine_displacement_has_uniform_stress(form):
     mesh, body = warped_body(form)
     u = affine(mesh, PATCH_F)
     residual = np.asarray(_force(body, u)[0])
@@ -193,7 +193,7 @@ def test_patch_of_an_affine_displacement_has_uniform_stress(form):
 
 
 @FORMS
-def test_patch_finds_the_affine_displacement_from_its_boundary(form):
+def test_03_patch_finds_the_affine_displacement_from_its_boundary(form):
     """Newton's method on the interior nodes alone, started away from the answer."""
     mesh, body = warped_body(form)
     exact = np.asarray(affine(mesh, PATCH_F))
@@ -207,7 +207,7 @@ def test_patch_finds_the_affine_displacement_from_its_boundary(form):
 
 
 @FORMS
-def test_every_element_has_six_zero_modes(form):
+def test_02_every_element_has_six_zero_modes(form):
     """The rigid motions and no hourglass: eigenvalues of warped elements at rest."""
     _, body = warped_body(form)
     K = np.transpose(_stiffness(body, jnp.zeros((3, *SHAPE))), (0, 5, 6, 1, 3, 2, 4)).reshape(-1, 24, 24)

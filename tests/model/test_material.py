@@ -131,7 +131,7 @@ def test_stress_is_the_derivative_of_energy(material, isochoric, samples):
 
 
 @MATERIALS
-def test_tangent_is_the_derivative_of_stress_at_constant_mean_stress(material, isochoric, samples):
+def test_05_tangent_is_the_derivative_of_stress_at_constant_mean_stress(material, isochoric, samples):
     mean = 0.3 * material.bulk
 
     def derivative(m, H):
@@ -157,7 +157,7 @@ def test_tangent_and_bulk_part_equal_a_central_difference(material, isochoric, s
 
 
 @MATERIALS
-def test_objectivity_and_isotropy(material, isochoric, samples):
+def test_01_objectivity_and_isotropy(material, isochoric, samples):
     rng = np.random.default_rng(1)
     Q = np.array([random_rotation(rng) for _ in samples])
     P, energy = piola(material, samples), _energy(material, as_field(samples))
@@ -225,7 +225,7 @@ def free_stretch(direction, stretches):
 
 
 @pytest.mark.parametrize(("stretch", "lateral", "sigma", "nominal", "zz", "xx"), TABLE_A)
-def test_table_a(stretch, lateral, sigma, nominal, zz, xx):
+def test_07_08_table_a(stretch, lateral, sigma, nominal, zz, xx):
     found = free_stretch((0, 1), [1.0, 1.0, stretch])
     assert abs(found - lateral) < PRINTED_STRETCH
     paths = [np.diag([found, found, stretch]), np.diag([1.0, 1.0, stretch])]
@@ -235,7 +235,7 @@ def test_table_a(stretch, lateral, sigma, nominal, zz, xx):
     assert abs(1e3 * piola(MR20, paths)[0, 2, 2] + nominal) < PRINTED_KPA
 
 
-def test_plane_strain_and_equibiaxial_stretch():
+def test_09_plane_strain_and_equibiaxial_stretch():
     lateral = free_stretch((0,), [1.0, 1.0, 0.8])
     through = free_stretch((2,), [1.5, 1.5, 1.0])
     np.testing.assert_allclose([lateral, through], [1.2217208, 0.4782747], rtol=0, atol=PRINTED_STRETCH)
@@ -244,7 +244,7 @@ def test_plane_strain_and_equibiaxial_stretch():
     np.testing.assert_allclose(biaxial, np.diag([13.258242, 13.258242, 0.0]), rtol=0, atol=PRINTED_KPA)
 
 
-def test_simple_shear():
+def test_09_simple_shear():
     shears = [EYE + gamma * np.outer(EYE[0], EYE[1]) for gamma in (0.5, 1.0)]
     half, whole = 1e3 * cauchy(MR20, shears)
     atol = 1e3 * ROUNDOFF * BULK

@@ -47,7 +47,7 @@ TABLE_E = [
 
 
 @pytest.mark.parametrize(("c", "p", "slope"), TABLE_E)
-def test_exponential_law_equals_table_e(c, p, slope):
+def test_22_exponential_law_equals_table_e(c, p, slope):
     got, derivative = pressure_and_slope(LAW, c * C0)
     np.testing.assert_allclose([got / P0, -C0 * derivative / P0], [p, slope], rtol=0, atol=1e-6)
 
@@ -61,7 +61,7 @@ def test_exponential_law_equals_its_closed_form():
 
 
 @pytest.mark.parametrize(("where", "slope"), [(1.0, 0.0), (-TANGENT_FROM, (8 * np.exp(7) - 1) / (np.e - 1))])
-def test_exponential_law_has_one_slope_at_its_joints(where, slope):
+def test_22_exponential_law_has_one_slope_at_its_joints(where, slope):
     steps = 1e-7 * np.array([-1.0, 0.0, 1.0])
     p, derivative = pressure_and_slope(LAW, C0 * (where + steps))
     np.testing.assert_allclose(-C0 / P0 * derivative, slope, rtol=1e-6, atol=1e-6)
@@ -76,7 +76,7 @@ def test_exponential_law_ends_at_its_clearance():
 
 @ALL_LAWS
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_laws_are_finite_a_thousand_clearances_away(law, side):
+def test_22_laws_are_finite_a_thousand_clearances_away(law, side):
     far = jnp.asarray(side * 1e3 * C0)
     p, slope = pressure_and_slope(law, far)
     assert np.isfinite(p)
@@ -135,7 +135,7 @@ def test_clearance_is_the_inverse_of_pressure_over_twelve_decades(law):
     assert np.all(np.abs(got / p - 1) <= ROUNDOFF + lost)
 
 
-def test_clearance_of_the_exponential_law_at_ten_kpa():
+def test_23_clearance_of_the_exponential_law_at_ten_kpa():
     np.testing.assert_allclose(LAW.clearance(jnp.asarray(0.01), SCALE), 9.094e-3, atol=0.5e-6)
 
 

@@ -43,7 +43,7 @@ def frictional() -> op.Solution:
     return op.solve(palpation(), op.Imprint(bumpy()))
 
 
-def test_forces_balance(frictional):
+def test_26_forces_balance(frictional):
     assert imbalance(frictional) < 1e-6
     assert float(frictional.stats["min_volume_ratio"]) > 0
     assert bool(frictional.result == op.RESULTS.successful)
@@ -203,7 +203,7 @@ def test_friction_raises_the_force_monotonically():
 
 
 @pytest.mark.parametrize(("p0", "c0"), [(1.0, 0.002), (5.0, 0.02), (1.0, 0.02)])
-def test_corrected_approach_does_not_depend_on_the_law(p0, c0):
+def test_24_corrected_approach_does_not_depend_on_the_law(p0, c0):
     flat = op.ThicknessMap(np.full((5, 5), 0.4), extent=SIZE)
 
     def mean_pressure(p0, c0):
