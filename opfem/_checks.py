@@ -13,9 +13,12 @@ from jaxtyping import Array
 
 
 def as_leaf(value: Any) -> Array:
-    """Convert a number or array to a floating-point leaf of the default precision."""
+    """Convert a number or array to a floating-point leaf; what has no precision of its own gets the default.
+
+    The type is stated, so that 0, 0.0 and np.float64(0) share one compilation.
+    """
     array = jnp.asarray(value)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
 def concrete(value: Any) -> np.ndarray | None:

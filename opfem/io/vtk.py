@@ -107,7 +107,7 @@ def _reference(dataset: xr.Dataset) -> Float[np.ndarray, "3 nz ny nx"]:
 
 
 def _point_arrays(dataset: xr.Dataset, displacement: np.ndarray) -> dict[str, np.ndarray]:
-    arrays = {"displacement_mm": displacement.reshape(3, -1).T}
+    arrays: dict[str, np.ndarray] = {"displacement_mm": displacement.reshape(3, -1).T}
     if "stress" in dataset:
         arrays["stress_MPa"] = dataset["stress"].values.reshape(9, -1).T
         arrays["green_strain"] = dataset["green_strain"].values.reshape(9, -1).T

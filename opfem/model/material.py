@@ -13,10 +13,14 @@ from .deformation import Kinematics, Tensor, identity_like, kinematics, outer, p
 
 
 class AbstractMaterial(eqx.Module):
-    """An isotropic law; `bulk` and `shear` are its initial moduli [MPa]."""
+    """An isotropic law; `bulk` is its bulk modulus [MPa]."""
 
     bulk: eqx.AbstractVar[Array]
-    shear: eqx.AbstractVar[Array]
+
+    @property
+    def shear(self) -> Array:
+        """Initial shear modulus [MPa]."""
+        raise NotImplementedError
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""

@@ -8,6 +8,7 @@ Source: Ogden, Non-linear Elastic Deformations, ch. 6; the spectral tangent as i
 Nonlinear Solid Mechanics, section 6.6.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -111,61 +112,67 @@ class Ogden(AbstractStretchMaterial):
 
     def density(self, strain: Stretches) -> Stretches:
         """Compute what each stretch stores [MPa]."""
-        return sum(2.0 * mu / alpha**2 * jnp.expm1(alpha * strain) for mu, alpha in self._terms())
+        return self._sum(lambda mu, alpha: 2.0 * mu / alpha**2 * jnp.expm1(alpha * strain))
 
     def slope(self, strain: Stretches) -> Stretches:
         """Compute w' [MPa] up to a constant."""
-        return sum(2.0 * mu / alpha * jnp.expm1(alpha * strain) for mu, alpha in self._terms())
+        return self._sum(lambda mu, alpha: 2.0 * mu / alpha * jnp.expm1(alpha * strain))
 
     def curvature(self, strain: Stretches) -> Stretches:
         """Compute w'' [MPa]."""
-        return sum(2.0 * mu * jnp.exp(alpha * strain) for mu, alpha in self._terms())
+        return self._sum(lambda mu, alpha: 2.0 * mu * jnp.exp(alpha * strain))
 
     def divided_difference(self, start: Array, step: Array) -> Array:
         """Compute (w'(start + step) - w'(start)) / step [MPa]."""
-        return sum(2.0 * mu * jnp.exp(alpha * start) * _relative_growth(alpha * step) for mu, alpha in self._terms())
+        return self._sum(lambda mu, alpha: 2.0 * mu * jnp.exp(alpha * start) * _relative_growth(alpha * step))
 
-    def _terms(self) -> list[tuple[Array, Array]]:
-        return [(self.mu[p], self.alpha[p]) for p in range(self.mu.size)]
+    def _sum(self, term: Callable[[Array, Array], Array]) -> Array:
+        terms = [term(self.mu[p], self.alpha[p]) for p in range(self.mu.size)]
+        return sum(terms[1:], start=terms[0])
 
 
 class Hencky(AbstractStretchMaterial):
-    """Hencky: ψ = shear |dev ln U|² + (bulk/2)(J - 1)², linear elasticity in logarithmic strain.
+    """Hencky: ψ = mu |dev ln U|² + (bulk/2)(J - 1)², linear elasticity in logarithmic strain.
 
-    The law to compare with small-strain results: its deviatoric Kirchhoff stress is 2 shear times the
+    The law to compare with small-strain results: its deviatoric Kirchhoff stress is 2 mu times the
     deviatoric logarithmic strain, its mean Cauchy stress bulk (J - 1). Abaqus has no equal; its *ELASTIC with
     NLGEOM is close (a rate form in the same strain, with bulk ln J for bulk (J - 1)).
 
     Args:
-        shear: Shear modulus [MPa], positive.
+        mu: Shear modulus [MPa], positive.
         bulk: Bulk modulus [MPa], positive.
 
     Raises:
         ValueError: If a number is out of its range.
     """
 
-    shear: Array = eqx.field(converter=as_leaf)
+    mu: Array = eqx.field(converter=as_leaf)
     bulk: Array = eqx.field(converter=as_leaf)
 
     def __check_init__(self):
-        check_positive("Hencky.shear", "MPa", self.shear)
+        check_positive("Hencky.mu", "MPa", self.mu)
         check_positive("Hencky.bulk", "MPa", self.bulk)
+
+    @property
+    def shear(self) -> Array:
+        """Shear modulus [MPa]."""
+        return self.mu
 
     def density(self, strain: Stretches) -> Stretches:
         """Compute what each stretch stores [MPa]."""
-        return self.shear * strain**2
+        return self.mu * strain**2
 
     def slope(self, strain: Stretches) -> Stretches:
         """Compute w' [MPa]."""
-        return 2.0 * self.shear * strain
+        return 2.0 * self.mu * strain
 
     def curvature(self, strain: Stretches) -> Stretches:
         """Compute w'' [MPa]."""
-        return jnp.broadcast_to(2.0 * self.shear, strain.shape)
+        return jnp.broadcast_to(2.0 * self.mu, strain.shape)
 
     def divided_difference(self, start: Array, step: Array) -> Array:
         """Compute (w'(start + step) - w'(start)) / step [MPa]."""
-        return jnp.broadcast_to(2.0 * self.shear, step.shape)
+        return jnp.broadcast_to(2.0 * self.mu, step.shape)
 
 
 class _Principal(NamedTuple):
@@ -280,9 +287,10 @@ def _spectrum(C: Tensor) -> tuple[Stretches, Tensor]:
         return jnp.stack(columns, axis=1)
 
     def sweep(_, state):
+        A, N = state
         for p, q in ((0, 1), (0, 2), (1, 2)):
-            state = rotated(*state, p, q)
-        return state
+            A, N = rotated(A, N, p, q)
+        return A, N
 
     A, N = jax.lax.fori_loop(0, _SWEEPS, sweep, (C, jnp.broadcast_to(identity_like(C), C.shape).astype(C.dtype)))
     return jnp.stack([A[0, 0], A[1, 1], A[2, 2]]), N

@@ -102,6 +102,11 @@ def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> No
             f"{name} needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}(). "
             "For a prescribed interface use Displacement."
         )
+    if isinstance(load, Displacement) and isinstance(palpation.sample, Bonded) and load.lateral == "free":
+        raise ValueError(
+            "Displacement(lateral='free') lets the interface slide, but the sample is Bonded(). "
+            "Pass lateral='fixed', or sample=Roller()."
+        )
     if isinstance(load, Displacement) and isinstance(palpation.sample, Contact):
         friction = concrete(palpation.sample.friction)
         if load.lateral == "free" and (friction is None or np.any(friction != 0)):

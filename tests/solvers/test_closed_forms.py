@@ -45,6 +45,30 @@ def test_07_08_uniform_compression(sides, element):
         np.testing.assert_allclose(-np.asarray(solution.traction[2]), expected * lateral**2, rtol=1e-6)
 
 
+def test_30_friction_bracket():
+    """VALIDATION.md test 30: the force between flat plates rises from free spreading to a bonded layer."""
+    layer, size, elements = op.Layer(0.5, MATERIAL), (5.0, 5.0), (4, 4, 2)
+    flat = op.Imprint(op.ThicknessMap(np.full((5, 5), 0.45), extent=size))
+    solutions = []
+    for friction in (0.0, 0.01, 0.05, 0.12, 0.3, 1.0):
+        window = op.Contact(op.HardOverclosure(), friction)
+        sample = op.Contact(op.ExponentialOverclosure(2.0, 0.01), friction)
+        solutions.append(op.solve(op.Palpation(layer, size, elements, window, sample), flat))
+    forces = np.array([-float(s.stats["force_sample"][2]) for s in solutions])
+    assert np.all(np.diff(forces) > 0)
+    shortened = [-float(np.mean(s.displacement[2, -1] - s.displacement[2, 0])) for s in solutions]
+    stretch = 1 - shortened[0] / 0.5
+    lateral = brentq(lambda t: cauchy(stretch, t)[0], 0.99, 2.0)
+    assert forces[0] == pytest.approx(-cauchy(stretch, lateral)[2] * 25 * lateral**2, rel=1e-6)
+    bonded = op.Palpation(layer, size, elements, op.Bonded(), op.Bonded())
+    held = op.solve(bonded, op.Displacement(-shortened[-1], lateral="fixed"))
+    assert forces[-1] == pytest.approx(-float(held.stats["force_sample"][2]), rel=0.02)
+    slip = [float((s.contact_status == 2).mean()) for s in solutions]
+    assert slip[0] == 1.0
+    assert slip[-1] == 0.0
+    assert np.all(np.diff(slip) <= 0)
+
+
 def transfer(x: float, nu: float, bonded: bool) -> float:
     """μG/h of VALIDATION.md, table B."""
     sinh, cosh = np.sinh(2 * x), np.cosh(2 * x)

@@ -114,7 +114,7 @@ CASES = {
     "preload, approach taken out": Case(corrected_and_continued, {"c10": 2.2e-3, "map": bump(21), **CONTACT}),
 }
 CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
-SLOW = {"preload, approach taken out": [pytest.mark.slow]}
+SLOW = {name: [pytest.mark.slow] for name in ("preload, approach taken out", "displacement on a spring")}
 
 
 @partial(jax.jit, static_argnums=0)
