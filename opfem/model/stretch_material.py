@@ -2,7 +2,7 @@
 
 ε_a = ln(J^(-1/3) λ_a). Stress and tangent are exact where stretches repeat or nearly do: differences over
 differences are computed as such, and derivatives of the stress go through its closed-form tangent,
-never through eigenvectors. A second derivative of the stress at equal stretches is NaN.
+never through eigenvectors. A second derivative of the stress by F is refused.
 
 Source: Ogden, Non-linear Elastic Deformations, ch. 6; the spectral tangent as in Holzapfel,
 Nonlinear Solid Mechanics, section 6.6.
@@ -265,6 +265,7 @@ def _second_piola_jvp(primals, tangents):
     return S, by_law + product(product(N, stress), transpose(N))
 
 
+@jax.custom_jvp
 def _spectrum(C: Tensor) -> tuple[Stretches, Tensor]:
     """Compute eigenvalues and eigenvectors (second axis) of symmetric 3×3 matrices, by Jacobi's rotations.
 
@@ -294,3 +295,11 @@ def _spectrum(C: Tensor) -> tuple[Stretches, Tensor]:
 
     A, N = jax.lax.fori_loop(0, _SWEEPS, sweep, (C, jnp.broadcast_to(identity_like(C), C.shape).astype(C.dtype)))
     return jnp.stack([A[0, 0], A[1, 1], A[2, 2]]), N
+
+
+@_spectrum.defjvp
+def _spectrum_jvp(primals, tangents):
+    raise NotImplementedError(
+        "Ogden and Hencky have no second derivative of the stress: eigenvectors have no derivative at equal stretches. "
+        "Use first derivatives, or a law in the invariants (MooneyRivlin, NeoHooke, Yeoh)."
+    )

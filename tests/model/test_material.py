@@ -194,6 +194,11 @@ def test_06_repeated_stretches(equal):
     assert_close(derivative, expected, 10 * ROUNDOFF)
 
 
+def test_second_derivative_of_the_stress_is_refused_where_it_has_none():
+    with pytest.raises(NotImplementedError, match="a law in the invariants"):
+        jax.hessian(lambda h: stress(op.Hencky(SHEAR, BULK), h).sum())(jnp.zeros((3, 3)))
+
+
 @MATERIALS
 def test_cauchy_stress_is_symmetric(material, isochoric, samples):
     sigma = cauchy(material, samples)

@@ -178,3 +178,16 @@ def test_a_path_too_long_to_record_has_no_derivative():
     value, gradient = jax.jit(jax.value_and_grad(mean_pressure))(5.8e-3)
     assert np.isfinite(value)
     assert np.isnan(gradient)
+
+
+@pytest.mark.slow
+def test_gradient_of_ogden_equals_that_of_mooney_rivlin():
+    def measured(material):
+        layer = op.Layer(0.5, material)
+        palpation = op.Palpation(layer, SIZE, (4, 4, 2), **contacts(CONTACT))
+        return measure(op.solve(palpation, op.Imprint(op.ThicknessMap(0.5 - bump(21), extent=SIZE)), ACCURATE))
+
+    bulk = 0.11612
+    value, slope = jax.value_and_grad(lambda c: measured(op.MooneyRivlin(c, 7.03e-4, bulk)))(2.2e-3)
+    twin = jax.value_and_grad(lambda c: measured(op.Ogden([2 * c, 2 * 7.03e-4], [2.0, -2.0], bulk)))(2.2e-3)
+    np.testing.assert_allclose(twin, (value, slope), SOLVER)
