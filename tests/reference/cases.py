@@ -26,9 +26,35 @@ def load_case(shared: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str,
     return stored, json.loads((folder / f"{name}.json").read_text())
 
 
-def layer(thickness: float = L0) -> op.Layer:
-    """Build the published layer."""
-    return op.Layer(thickness, op.MooneyRivlin(**MATERIAL))
+def layer(thickness: float = L0, bulk: float = MATERIAL["bulk"]) -> op.Layer:
+    """Build the published layer, or one of another bulk modulus [MPa]."""
+    return op.Layer(thickness, op.MooneyRivlin(**{**MATERIAL, "bulk": bulk}))
+
+
+def formula_family(variant: str, n: int, element: str) -> tuple[op.Palpation, op.Displacement]:
+    """State a quarter of a case of the formula family, whose whole has n × n × n/4 elements.
+
+    The problem is symmetric about its middle, where the quarter's x and y start: a quarter of the force
+    and of the energy are the reference's.
+
+    Args:
+        variant: "B1" (window bonded, interface held laterally), "B2" (window bonded) or "B3" (both slide).
+        n: Elements along a side of the whole, a multiple of 4.
+        element: As in `op.Palpation`.
+    """
+    bump = np.cos(np.pi * np.linspace(0.0, 1.0, n // 2 + 1))
+    window = op.Roller() if variant == "B3" else op.Bonded()
+    palpation = op.Palpation(
+        layer(),
+        extent=(1.0, 1.0),
+        elements=(n // 2, n // 2, n // 4),
+        window=window,
+        sample=op.Bonded() if variant == "B1" else op.Roller(),
+        sides={"x0": "roller", "y0": "roller"},
+        element=element,
+    )
+    uz = -0.05 * (1.0 + np.outer(bump, bump))  # mm
+    return palpation, op.Displacement(uz, lateral="fixed" if variant == "B1" else "free")
 
 
 def imprint_map(case: dict[str, np.ndarray]) -> op.ThicknessMap:
@@ -58,14 +84,18 @@ def top_stress(case: dict[str, np.ndarray], n: int = 40) -> np.ndarray:
 
 
 def coin(
-    friction_window: float | None, friction_sample: float, stiffness: float, hold: float | None = None
+    friction_window: float | None,
+    friction_sample: float,
+    stiffness: float,
+    hold: float | None = None,
+    element: str = "full",
 ) -> op.Palpation:
     """State a contact case of the coin; no window friction means the window's u_z is held."""
     window = op.Roller()
     if friction_window is not None:
         window = op.Contact(op.LinearOverclosure(10.0), friction_window, stick_slope=0.1)
     sample = op.Contact(op.LinearOverclosure(stiffness), friction_sample, stick_slope=0.02)
-    return op.Palpation(layer(), (FIELD, FIELD), (40, 40, 4), window, sample, element="full", hold=hold)
+    return op.Palpation(layer(), (FIELD, FIELD), (40, 40, 4), window, sample, element=element, hold=hold)
 
 
 def normal_force(solution: op.Solution) -> float:
