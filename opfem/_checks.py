@@ -37,6 +37,13 @@ def _number(field: str, unit: str, value: Any, holds, expected: str) -> None:
         raise ValueError(f"{field} [{unit}] must be {expected}, got {got}.")
 
 
+def check_modulus(field: str, unit: str, value: Any) -> None:
+    """Raise ValueError unless the value is positive, infinite included, or traced."""
+    known = concrete(value)
+    if known is None or known.dtype.kind != "f" or not np.all(known == np.inf):
+        _number(field, unit, value, lambda v: v > 0, "positive, or jnp.inf for incompressible")
+
+
 def check_positive(field: str, unit: str, value: Any) -> None:
     """Raise ValueError unless the value is finite and positive, or traced."""
     _number(field, unit, value, lambda v: v > 0, "positive")

@@ -1,113 +1,188 @@
-"""Energy, internal force and element stiffness of the layer.
+"""Energy, internal force and stiffness of a solid body, over any cells.
 
-Two element forms share everything but the volume they measure: `full` takes J at each Gauss
-point, `mean_dilatation` takes the element's mean (energy of F with the element-mean J: symmetric,
-free of volumetric locking). Source: Simo, Taylor & Pister, CMAME 51 (1985) 177.
+The forms differ in what of the deformation their cells measure:
+
+- `full`: everything at each point. Locks when nearly incompressible.
+- `mean_dilatation`: J is the cell's mean (energy of F with the mean J: symmetric, free of volumetric
+  locking). Source: Simo, Taylor & Pister, CMAME 51 (1985) 177.
+- `hybrid`: the same with the cell's mean stress as an unknown of its own, up to truly incompressible.
+- `reduced`: one point with the cell's mean F; what that leaves without stiffness is held by a small
+  energy of F's deviation from its mean, which vanishes in uniform strain and does not see rotation.
 """
 
+import itertools
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import AbstractMaterial, LayerMesh
-from ..model.deformation import Kinematics, kinematics, outer
-from .hex8 import GRADIENTS, assemble, gather
-from .kinematics import ElementGeometry, contract, displacement_gradient, element_geometry
+from ..model.deformation import Kinematics, identity_like, kinematics, outer
+from .kinematics import AbstractCells, LayerCells, layer_cells
 
-ElementForm = Literal["mean_dilatation", "full"]
+Form = Literal["full", "mean_dilatation", "hybrid", "reduced"]
 
-# D_aα D_bβ summed over Gauss points by one matrix product: `(8 a, 8 b, 8 q · 3 α · 3 β)`.
-_PAIRS = np.einsum("qma,qnb->abqmn", GRADIENTS, GRADIENTS).reshape(8, 8, 72)
+# Cells and form of every element that a layer can be made of.
+ELEMENT_FORMS: dict[str, tuple[str, Form]] = {
+    "mean_dilatation": ("hex8", "mean_dilatation"),
+    "full": ("hex8", "full"),
+    "reduced": ("hex8", "reduced"),
+    "hybrid": ("hex8", "hybrid"),
+    "tet4": ("tet4", "full"),
+    "tet10": ("tet10", "full"),
+}
+# Stiffness of the hourglass modes of `reduced`, relative to the shear modulus.
+HOURGLASS = 0.05
 
 
-class LayerBody(eqx.Module):
-    """The deformable layer: its material, geometry and element form."""
+class SolidBody(eqx.Module):
+    """A deformable body: its material, cells and form.
+
+    Every method takes the displacement u [mm] at the nodes, `(3, *nodes)`, and for `hybrid` the cells'
+    mean stress [MPa], `(*cells)`, tension positive; None for the other forms.
+    """
 
     material: AbstractMaterial
-    geometry: ElementGeometry
-    form: ElementForm = eqx.field(static=True)
+    cells: AbstractCells
+    form: Form = eqx.field(static=True)
 
-    def energy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, ""]:
+    def energy(self, u: Array, mean_stress: Array | None = None) -> Float[Array, ""]:
         """Compute the strain energy [N mm]."""
-        k = kinematics(displacement_gradient(self.geometry, gather(u)))
-        return jnp.sum(self._energy_density(k) * self.geometry.weight)
+        H = self.cells.displacement_gradient(u)
+        k, weight = self._measured(self.cells, H)
+        return jnp.sum(self._energy_density(k, mean_stress) * weight) + self._hourglass_energy(H)
 
-    def internal_force(self, u: Float[Array, "3 mz my mx"]) -> tuple[Float[Array, "3 mz my mx"], Array]:
-        """Compute dEnergy/du [N] and the smallest J of any Gauss point."""
-        k = kinematics(displacement_gradient(self.geometry, gather(u)))
-        P = self.material.first_piola(k, self.material.volumetric_stress(self._volume_change(k)))
-        flux = self.geometry.to_reference(P * self.geometry.weight)
-        by_point = jnp.transpose(flux, (2, 1, 0, 3, 4, 5))
-        nodal = contract(_FROM_POINTS, by_point.reshape(24, *by_point.shape[2:]))
-        return assemble(nodal), jnp.min(k.J)
+    def internal_force(self, u: Array, mean_stress: Array | None = None) -> tuple[Array, Array]:
+        """Compute dEnergy/du [N] at the nodes and the smallest J of any point."""
+        H = self.cells.displacement_gradient(u)
+        k, _ = self._measured(self.cells, H)
+        P = self.material.first_piola(k, self._mean_stress(self.cells, k, mean_stress))
+        if self.form == "reduced":
+            P = P + self._hourglass_stiffness * (H - self.cells.mean(H, 2))
+        return self.cells.assemble(self.cells.nodal_vectors(P * self.cells.weight)), jnp.min(k.J)
 
-    def stiffness(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "nz 8 8 3 3 ny nx"]:
-        """Compute the element stiffness [N/mm]: K[a, b, i, k] = df[a, i]/du[b, k].
+    def cell_stiffness(self, u: Array, mean_stress: Array | None = None, bulk: Array | None = None) -> Array:
+        """Compute the stiffness [N/mm] of each cell, K[a, b, i, k] = df[a, i]/du[b, k].
 
-        One layer of elements at a time, so that the tangent moduli stay in the cache.
+        Args:
+            u: Displacement.
+            mean_stress: For `hybrid`.
+            bulk: For `hybrid`: stiffness of each cell's volume [MPa] that is added to the stiffness at
+                constant mean stress; None: none.
+
+        Returns:
+            `(a, b, 3, 3, *cells)`; in a layer, layers first: `(nz, a, b, 3, 3, ny, nx)`.
         """
+        fields = () if mean_stress is None else (mean_stress,)
 
-        def one_layer(inputs):
-            nodal, slope_x, slope_y = inputs
-            geometry = ElementGeometry(self.geometry.spacing, self.geometry.depth, slope_x[:, None], slope_y[:, None])
-            return self._layer_stiffness(geometry, nodal[:, :, None])
+        def part(cells, H, *fields):
+            return self._stiffness(cells, H, bulk, *fields)
 
-        nodal = gather(u)
-        per_layer = (
-            jnp.moveaxis(nodal, 2, 0),
-            *(jnp.moveaxis(s, 1, 0) for s in (self.geometry.slope_x, self.geometry.slope_y)),
-        )
-        return jax.lax.map(one_layer, per_layer)
+        return self.cells.in_parts(part, u, *fields)
 
-    def _layer_stiffness(self, geometry: ElementGeometry, nodal: Array) -> Float[Array, "8 8 3 3 ny nx"]:
-        k = kinematics(displacement_gradient(geometry, nodal))
-        mean_stress = self.material.volumetric_stress(self._volume_change(k, geometry))
-        A = self.material.tangent(k, mean_stress)
+    def point_tangent(self, u: Array) -> Float[Array, "3 3 3 3 points *cells"]:
+        """Compute dP/dF times the points' volumes [N mm], of a form that measures at each point."""
+        assert self.form == "full"
+        k, weight = self._measured(self.cells, self.cells.displacement_gradient(u))
+        return self._full_tangent(k) * weight
+
+    def volume_residual(self, u: Array, mean_stress: Array) -> Array:
+        """Compute V (mean J - 1 - mean stress/bulk) of each cell [mm³], zero in a `hybrid` equilibrium."""
+        k, _ = self._measured(self.cells, self.cells.displacement_gradient(u))
+        change = self.cells.mean(k.volume_change)[0]
+        return self.cells.volume[0] * (change - mean_stress / self.material.bulk)
+
+    def volume_vectors(self, u: Array) -> Float[Array, "a 3 *cells"]:
+        """Compute the derivative of each cell's volume by its nodes [mm²]."""
+        k, weight = self._measured(self.cells, self.cells.displacement_gradient(u))
+        return self.cells.nodal_vectors(k.J * k.G * weight)
+
+    def fields(self, u: Array, mean_stress: Array | None = None) -> tuple[Array, Array, Array]:
+        """Compute F [-], Cauchy stress [MPa] and energy per reference volume [MPa] at the points.
+
+        `reduced` has one point to a cell. The energy leaves out what holds its hourglass modes.
+        """
+        k, _ = self._measured(self.cells, self.cells.displacement_gradient(u))
+        P = self.material.first_piola(k, self._mean_stress(self.cells, k, mean_stress))
+        cauchy = sum(P[:, j, None] * k.F[None, :, j] for j in range(3)) / k.J
+        return k.F, cauchy, self._energy_density(k, mean_stress)
+
+    def field_volume(self) -> Array:
+        """Compute the reference volume [mm³] that each value of `fields` stands for."""
+        return self.cells.volume if self.form == "reduced" else self.cells.weight
+
+    def _measured(self, cells: AbstractCells, H: Array) -> tuple[Kinematics, Array]:
+        """Compute the kinematics that the form measures, and the volume of each of its points."""
+        if self.form == "reduced":
+            return kinematics(cells.mean(H, 2)), cells.volume
+        return kinematics(H), cells.weight
+
+    def _mean_stress(self, cells: AbstractCells, k: Kinematics, mean_stress: Array | None) -> Array:
+        if self.form == "hybrid":
+            assert mean_stress is not None
+            return mean_stress[None]
+        return self.material.volumetric_stress(self._volume_change(cells, k))
+
+    def _volume_change(self, cells: AbstractCells, k: Kinematics) -> Array:
+        return cells.mean(k.volume_change) if self.form in ("mean_dilatation", "hybrid") else k.volume_change
+
+    def _energy_density(self, k: Kinematics, mean_stress: Array | None) -> Array:
+        change = self._volume_change(self.cells, k)
+        volumetric = self.material.volumetric_energy(change) if mean_stress is None else 0.5 * mean_stress * change
+        return self.material.isochoric_energy(k) + volumetric
+
+    def _full_tangent(self, k: Kinematics) -> Array:
+        A = self.material.tangent(k, self.material.volumetric_stress(k.volume_change))
+        return A + (self.material.bulk * k.J**2) * outer(k.G, k.G)
+
+    def _stiffness(self, cells: AbstractCells, H: Array, bulk: Array | None, mean_stress: Array | None = None) -> Array:
+        k, weight = self._measured(cells, H)
+        if self.form == "reduced":
+            return self._reduced_stiffness(cells, k)
         if self.form == "full":
-            A = A + (self.material.bulk * k.J**2) * outer(k.G, k.G)
-        A = geometry.to_reference(A * geometry.weight, axis=1)
-        A = geometry.to_reference(A, axis=3)[:, :, :, :, :, 0]  # (i, α, k, β, q, ny, nx)
-        A = jnp.transpose(A, (4, 1, 3, 0, 2, 5, 6))
-        K = contract(_PAIRS, A.reshape(72, *A.shape[3:]))
-        if self.form == "full":
+            return cells.matrices(self._full_tangent(k) * weight)
+        K = cells.matrices(self.material.tangent(k, self._mean_stress(cells, k, mean_stress)) * weight)
+        stiffness = bulk if self.form == "hybrid" else self.material.bulk
+        if stiffness is None:
             return K
-        flux = geometry.to_reference(k.J * k.G * geometry.weight)[:, :, :, 0]
-        by_point = jnp.transpose(flux, (2, 1, 0, 3, 4))
-        dv = contract(_FROM_POINTS, by_point.reshape(24, *by_point.shape[2:]))  # (a, i, ny, nx)
-        volume = jnp.sum(geometry.weight, axis=0)[0]
-        return K + (self.material.bulk / volume) * (dv[:, None, :, None] * dv[None, :, None, :])
+        dv = cells.nodal_vectors(k.J * k.G * weight)
+        return K + (stiffness / cells.volume[0]) * (dv[:, None, :, None] * dv[None, :, None, :])
 
-    def _volume_change(self, k: Kinematics, geometry: ElementGeometry | None = None) -> Array:
-        if self.form == "full":
-            return k.volume_change
-        weight = (geometry or self.geometry).weight
-        return jnp.sum(k.volume_change * weight, axis=0) / jnp.sum(weight, axis=0)
+    @property
+    def _hourglass_stiffness(self) -> Array:
+        return HOURGLASS * self.material.shear
 
-    def cauchy(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "3 3 8 nz ny nx"]:
-        """Compute Cauchy stress [MPa] at the Gauss points, tension positive."""
-        return self._cauchy(kinematics(displacement_gradient(self.geometry, gather(u))))
+    def _hourglass_energy(self, H: Array) -> Array | float:
+        if self.form != "reduced":
+            return 0.0
+        deviation = H - self.cells.mean(H, 2)
+        return 0.5 * self._hourglass_stiffness * jnp.sum(deviation**2 * self.cells.weight)
 
-    def fields(self, u: Float[Array, "3 mz my mx"]) -> tuple[Array, Array, Float[Array, "8 nz ny nx"]]:
-        """Compute F [-], Cauchy stress [MPa] and energy per reference volume [MPa] at the Gauss points."""
-        k = kinematics(displacement_gradient(self.geometry, gather(u)))
-        return k.F, self._cauchy(k), self._energy_density(k)
-
-    def _cauchy(self, k: Kinematics) -> Float[Array, "3 3 8 nz ny nx"]:
-        P = self.material.first_piola(k, self.material.volumetric_stress(self._volume_change(k)))
-        return sum(P[:, j, None] * k.F[None, :, j] for j in range(3)) / k.J
-
-    def _energy_density(self, k: Kinematics) -> Float[Array, "8 nz ny nx"]:
-        return self.material.isochoric_energy(k) + self.material.volumetric_energy(self._volume_change(k))
+    def _reduced_stiffness(self, cells: AbstractCells, k: Kinematics) -> Array:
+        eye = identity_like(k.F)
+        mean = cells.nodal_vectors(eye * (cells.weight / cells.volume))  # mean dN_a/dX_J `(a, J, *cells)`
+        held = self._hourglass_stiffness * (eye[:, None, :, None] * eye[None, :, None, :])
+        A = ((self._full_tangent(k) - held) * cells.volume)[:, :, :, :, 0]
+        K = cells.matrices(held * cells.weight)
+        for J, L in itertools.product(range(3), repeat=2):
+            K = K + mean[:, None, None, None, J] * A[None, None, :, J, :, L] * mean[None, :, None, None, L]
+        return K
 
 
-# dN_a/dξ_α with points first: `(8 a, 8 q · 3 α)`.
-_FROM_POINTS = np.transpose(GRADIENTS, (2, 0, 1)).reshape(8, 24)
+class LayerBody(SolidBody):
+    """The deformable layer: a body of structured cells."""
+
+    cells: LayerCells
 
 
-def layer_body(mesh: LayerMesh, material: AbstractMaterial, form: ElementForm) -> LayerBody:
-    """Build the deformable layer."""
-    return LayerBody(material, element_geometry(mesh), form)
+def layer_body(mesh: LayerMesh, material: AbstractMaterial, element: str) -> LayerBody:
+    """Build the deformable layer.
+
+    Args:
+        mesh: Its mesh.
+        material: Its material.
+        element: One of `ELEMENT_FORMS`.
+    """
+    cells, form = ELEMENT_FORMS[element]
+    return LayerBody(material, layer_cells(mesh, cells), form)

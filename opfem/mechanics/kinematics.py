@@ -1,55 +1,251 @@
-"""Geometry of the structured elements, and gradients at their Gauss points.
+"""Cells and their quadrature points: geometry, gradients, forces and matrices of what fills the layer.
 
-An element's map is X = hx (i + ξ), Y = hy (j + η), Z = L0(ξ, η)(k + ζ)/nz, so its inverse
-gradient has five entries, all known in closed form.
+A cell is what one set of shape functions covers: an element, or for tetrahedra the box that six of
+them fill. A cell's map is X = hx (i + ξ), Y = hy (j + η), with columns of nodes that stand upright, so
+its inverse gradient has five entries, all known in closed form.
 """
 
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import LayerMesh
-from .hex8 import GAUSS_POINTS, GRADIENTS
+from .hex8 import CORNERS, GAUSS_POINTS, GRADIENTS, assemble, gather
+from .tet import EDGES, FOUR_POINTS, kuhn_tetrahedra, linear_gradients, quadratic_gradients
 
 
-class ElementGeometry(eqx.Module):
-    """The inverse map of every element at its Gauss points, and their weights.
+class CellKind(NamedTuple):
+    """Shape functions of a cell on the unit cube.
 
     Attributes:
-        spacing: Element sizes in x and y [mm], `(2,)`.
-        depth: Element height dZ/dζ at the Gauss points `(8, 1, ny, nx)` [mm].
-        slope_x: (dZ/dξ)/(dZ/dζ) `(8, nz, ny, nx)` [-].
-        slope_y: (dZ/dη)/(dZ/dζ) `(8, nz, ny, nx)` [-].
+        nodes: Places of the nodes (x, y, z), in elements, `(nodes, 3)`.
+        points: Quadrature points (ξ, η, ζ) `(points, 3)`.
+        gradients: dN_a/dξ_α at the points `(points, 3, nodes)`.
+        weights: Weights of the points, of sum 1 `(points,)`.
+    """
+
+    nodes: np.ndarray
+    points: np.ndarray
+    gradients: np.ndarray
+    weights: np.ndarray
+
+    @property
+    def span(self) -> int:
+        """Elements that the cell covers along each axis."""
+        return int(self.nodes.max())
+
+    @property
+    def from_points(self) -> np.ndarray:
+        """dN_a/dξ_α with points first: `(nodes a, points q · 3 α)`."""
+        return np.transpose(self.gradients, (2, 0, 1)).reshape(len(self.nodes), -1)
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """D_aα D_bβ by points: sums over points are one matrix product: `(a, b, q · 3 α · 3 β)`."""
+        n = len(self.nodes)
+        return np.einsum("qma,qnb->abqmn", self.gradients, self.gradients).reshape(n, n, -1)
+
+
+def _tetrahedra(span: int) -> CellKind:
+    """Fill a cell with six tetrahedra, linear (span 1) or quadratic (span 2)."""
+    nodes = np.array(CORNERS) if span == 1 else np.indices((3, 3, 3)).reshape(3, -1)[::-1].T
+    place = {tuple(node): a for a, node in enumerate(nodes)}
+    points, gradients = [], []
+    for vertices in kuhn_tetrahedra():
+        corners = span * vertices
+        middles = [(corners[a] + corners[b]) // 2 for a, b in EDGES]
+        own = [place[tuple(node)] for node in [*corners, *(middles if span == 2 else [])]]
+        for point in FOUR_POINTS if span == 2 else np.full((1, 4), 0.25):
+            d = quadratic_gradients(vertices, point) if span == 2 else linear_gradients(vertices)
+            whole = np.zeros((3, len(nodes)))
+            whole[:, own] = d.T
+            points.append(point @ vertices)
+            gradients.append(whole)
+    return CellKind(nodes, np.array(points), np.array(gradients), np.full(len(points), 1.0 / len(points)))
+
+
+CELLS = {
+    "hex8": CellKind(np.array(CORNERS), GAUSS_POINTS, GRADIENTS, np.full(8, 1.0 / 8.0)),
+    "tet4": _tetrahedra(1),
+    "tet10": _tetrahedra(2),
+}
+
+
+class AbstractCells(eqx.Module):
+    """What a body is integrated over; the caller multiplies stresses and tangents with `weight`."""
+
+    weight: eqx.AbstractVar[Array]  # reference volume of the points [mm³], (points, *cells)
+
+    def displacement_gradient(self, u: Array) -> Float[Array, "3 3 points *cells"]:
+        """Compute H[i, J] = du_i/dX_J at the points."""
+        raise NotImplementedError
+
+    def nodal_vectors(self, stress: Float[Array, "3 3 points *cells"]) -> Float[Array, "a 3 *cells"]:
+        """Sum stress[i, J] dN_a/dX_J over the points of each cell."""
+        raise NotImplementedError
+
+    def assemble(self, vectors: Float[Array, "a 3 *cells"]) -> Array:
+        """Add the nodal values of the cells into nodes."""
+        raise NotImplementedError
+
+    def matrices(self, tangent: Float[Array, "3 3 3 3 points *cells"]) -> Float[Array, "a b 3 3 *cells"]:
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell."""
+        raise NotImplementedError
+
+    def in_parts(self, function: Callable, u: Array, *fields: Any) -> Any:
+        """Evaluate function(cells, displacement gradient, fields) for parts of the mesh: here in one."""
+        return function(self, self.displacement_gradient(u), *fields)
+
+    def mean(self, values: Float[Array, "*components_points_cells"], components: int = 0) -> Array:
+        """Average over the reference volume of each cell, keeping an axis of one point."""
+        return jnp.sum(values * self.weight, axis=components, keepdims=True) / self.volume
+
+    @property
+    def volume(self) -> Float[Array, "1 *cells"]:
+        """Reference volume of the cells [mm³]."""
+        return jnp.sum(self.weight, axis=0, keepdims=True)
+
+
+class LayerCells(AbstractCells):
+    """The inverse map of every cell of the layer at its points, and their weights.
+
+    Attributes:
+        spacing: Cell sizes in x and y [mm], `(2,)`.
+        depth: Cell height dZ/dζ at the points `(points, 1 or nz, ny, nx)` [mm].
+        slope_x: (dZ/dξ)/(dZ/dζ) `(points, nz, ny, nx)` [-].
+        slope_y: (dZ/dη)/(dZ/dζ) `(points, nz, ny, nx)` [-].
+        name: "hex8", "tet4" or "tet10".
     """
 
     spacing: Float[Array, "2"]
-    depth: Float[Array, "8 1 ny nx"]
-    slope_x: Float[Array, "8 nz ny nx"]
-    slope_y: Float[Array, "8 nz ny nx"]
+    depth: Float[Array, "points 1 ny nx"]
+    slope_x: Float[Array, "points nz ny nx"]
+    slope_y: Float[Array, "points nz ny nx"]
+    name: str = eqx.field(static=True, default="hex8")
 
     @property
-    def weight(self) -> Float[Array, "8 1 ny nx"]:
-        """Reference volume of the Gauss points [mm³]."""
-        return self.depth * (self.spacing[0] * self.spacing[1] / 8.0)
+    def kind(self) -> CellKind:
+        """Shape functions and points of the cells."""
+        return CELLS[self.name]
 
-    def from_reference(self, gradient: Array) -> Array:
-        """Turn d/dξ `(8, 3, c, nz, ny, nx)` into d/dX `(c, 3, 8, nz, ny, nx)`."""
+    @property
+    def weight(self) -> Float[Array, "points 1 ny nx"]:
+        """Reference volume of the points [mm³]."""
+        return self.depth * (self.spacing[0] * self.spacing[1] * self.kind.weights[:, None, None, None])
+
+    @property
+    def element_spacing(self) -> Float[Array, "2"]:
+        """Element sizes in x and y [mm]."""
+        return self.spacing / self.kind.span
+
+    @property
+    def element_depth(self) -> Array:
+        """Mean height of an element [mm]."""
+        return jnp.mean(self.depth) / self.kind.span
+
+    def gather(self, u: Float[Array, "c mz my mx"]) -> Float[Array, "a c nz ny nx"]:
+        """Collect the nodal values of every cell."""
+        if self.name == "hex8":
+            return gather(u)
+        span = self.kind.span
+        ends = [(n - 1) // span * span for n in u.shape[1:]]
+        return jnp.stack(
+            [
+                u[:, z : z + ends[0] : span, y : y + ends[1] : span, x : x + ends[2] : span]
+                for x, y, z in self.kind.nodes.tolist()
+            ]
+        )
+
+    def assemble(self, vectors: Float[Array, "a c nz ny nx"]) -> Float[Array, "c mz my mx"]:
+        """Add the nodal values of the cells into nodes: the transpose of `gather`."""
+        if self.kind.span == 1:
+            return assemble(vectors)
+        span, zero = self.kind.span, jnp.zeros((), vectors.dtype)
+
+        def placed(values, node):
+            # Values stand `span` nodes apart, from the node's own place in the first cell on.
+            widths = [(at, span - at, span - 1) for at in node]
+            shape = [n * span + 1 for n in values.shape[1:]]
+            spread = jax.lax.pad(values, zero, [(0, 0, 0), *widths])
+            return spread[:, : shape[0], : shape[1], : shape[2]]
+
+        parts = [placed(values, node[::-1]) for values, node in zip(vectors, self.kind.nodes.tolist(), strict=True)]
+        return functools.reduce(jnp.add, parts)
+
+    def displacement_gradient(self, u: Float[Array, "3 mz my mx"]) -> Float[Array, "3 3 points nz ny nx"]:
+        """Compute H[i, J] = du_i/dX_J at the points."""
+        return self._gradient(self.gather(u))
+
+    def nodal_vectors(self, stress: Float[Array, "3 3 points nz ny nx"]) -> Float[Array, "a 3 nz ny nx"]:
+        """Sum stress[i, J] dN_a/dX_J over the points of each cell."""
+        flux = jnp.transpose(self._to_reference(stress), (2, 1, 0, 3, 4, 5))
+        return contract(self.kind.from_points, flux.reshape(-1, *flux.shape[2:]))
+
+    def matrices(self, tangent: Float[Array, "3 3 3 3 points nz ny nx"]) -> Float[Array, "a b 3 3 nz ny nx"]:
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell."""
+        A = self._to_reference(self._to_reference(tangent, axis=1), axis=3)
+        A = jnp.transpose(A, (4, 1, 3, 0, 2, 5, 6, 7))
+        return contract(self.kind.pairs, A.reshape(-1, *A.shape[3:]))
+
+    def in_parts(self, function: Callable, u: Float[Array, "3 mz my mx"], *fields: Any) -> Any:
+        """Evaluate function(cells, displacement gradient, fields) one layer of cells at a time.
+
+        So what it holds stays in the cache. Results come layers first.
+        """
+        whole = [self.gather(u), self.slope_x, self.slope_y, *fields]
+        if self.depth.shape[1] > 1:
+            whole.append(self.depth)
+
+        def one_layer(layer):
+            nodal, slope_x, slope_y, *rest = (jnp.expand_dims(v, v.ndim - 2) for v in layer)
+            depth = rest.pop() if self.depth.shape[1] > 1 else self.depth
+            cells = LayerCells(self.spacing, depth, slope_x, slope_y, self.name)
+            return function(cells, cells._gradient(nodal), *rest)
+
+        results = jax.lax.map(one_layer, [jnp.moveaxis(v, -3, 0) for v in whole])
+        return jax.tree.map(lambda v: jnp.squeeze(v, axis=-3), results)
+
+    def element_mean(self, values: Float[Array, "*components points cz cy cx"], volume: Array) -> Array:
+        """Average a field over the reference volume [mm³] of each cell: `(*components, nz, ny, nx)`.
+
+        All elements of a cell have its value.
+        """
+        mean = jnp.sum(values * volume, axis=-4) / jnp.sum(volume, axis=0)
+        for axis in (-3, -2, -1):
+            mean = jnp.repeat(mean, self.kind.span, axis=axis)
+        return mean
+
+    def _gradient(self, nodal: Float[Array, "a 3 nz ny nx"]) -> Float[Array, "3 3 points nz ny nx"]:
+        """Turn the nodal values of the cells into d/dX at the points."""
+        gradient = contract(self.kind.gradients, nodal)
         xi, eta, zeta = gradient[:, 0], gradient[:, 1], gradient[:, 2]
         sx, sy = self.slope_x[:, None], self.slope_y[:, None]
         d_dx = (xi - sx * zeta) / self.spacing[0]
         d_dy = (eta - sy * zeta) / self.spacing[1]
         return jnp.moveaxis(jnp.stack([d_dx, d_dy, zeta / self.depth[:, None]]), 2, 0)
 
-    def to_reference(self, flux: Array, axis: int = 1) -> Array:
-        """Turn a flux along X `(…, 8, nz, ny, nx)`, X at `axis`, into one along ξ: `from_reference` transposed."""
+    def _to_reference(self, flux: Array, axis: int = 1) -> Array:
+        """Turn a flux along X `(…, points, nz, ny, nx)`, X at `axis`, into one along ξ: `_gradient` transposed."""
         x, y, z = (jnp.take(flux, k, axis=axis) for k in range(3))
         x, y = x / self.spacing[0], y / self.spacing[1]
         return jnp.stack([x, y, z / self.depth - self.slope_x * x - self.slope_y * y], axis=axis)
 
 
-def element_geometry(mesh: LayerMesh) -> ElementGeometry:
-    """Compute the inverse map of every element of the mesh."""
+def layer_cells(mesh: LayerMesh, name: str = "hex8") -> LayerCells:
+    """Compute the inverse map of every cell of the mesh at its points.
+
+    Args:
+        mesh: The mesh.
+        name: "hex8", "tet4", or "tet10" for cells of 2 × 2 × 2 elements.
+    """
+    if name != "hex8":
+        return _from_positions(mesh, name)
     nz = mesh.layers
     L0 = mesh.thickness
     low_x, high_x = _ends(L0, 1)
@@ -60,7 +256,7 @@ def element_geometry(mesh: LayerMesh) -> ElementGeometry:
     thickness = (1 - eta) * south + eta * north
     d_xi = (1 - eta) * (corners[1][0] - corners[0][0]) + eta * (corners[1][1] - corners[0][1])
     fraction = np.arange(nz)[None, :, None, None] + zeta[:, None]
-    return ElementGeometry(
+    return LayerCells(
         spacing=jnp.stack(mesh.spacing),
         depth=jnp.asarray(thickness[:, None] / nz),
         slope_x=jnp.asarray(fraction * (d_xi / thickness)[:, None]),
@@ -68,11 +264,13 @@ def element_geometry(mesh: LayerMesh) -> ElementGeometry:
     )
 
 
-def displacement_gradient(
-    geometry: ElementGeometry, nodal: Float[Array, "8 3 nz ny nx"]
-) -> Float[Array, "3 3 8 nz ny nx"]:
-    """Compute H[i, J] = du_i/dX_J at the Gauss points from element nodal displacements."""
-    return geometry.from_reference(contract(GRADIENTS, nodal))
+def _from_positions(mesh: LayerMesh, name: str) -> LayerCells:
+    """Take the map's gradient from the nodes: isoparametric."""
+    spacing = jnp.stack(mesh.spacing) * CELLS[name].span
+    one = jnp.ones((1, 1, 1, 1), mesh.thickness.dtype)
+    gather = LayerCells(spacing, one, one, one, name).gather
+    dZ = contract(CELLS[name].gradients, gather(mesh.positions()[2:]))[:, :, 0]
+    return LayerCells(spacing, dZ[:, 2], dZ[:, 0] / dZ[:, 2], dZ[:, 1] / dZ[:, 2], name)
 
 
 def contract(matrix: np.ndarray, values: Array) -> Array:

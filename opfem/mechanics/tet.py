@@ -29,7 +29,7 @@ def quadratic_gradients(vertices: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 def kuhn_tetrahedra() -> np.ndarray:
-    """List the vertices of the six tetrahedra of the unit cube, `(6 tetrahedra, 4 vertices, 3)`, all of positive volume."""
+    """List the vertices of the six tetrahedra of the unit cube, `(6, 4, 3)`, all of positive volume."""
     tetrahedra = []
     for order in itertools.permutations(range(3)):
         steps = np.eye(3, dtype=int)[list(order)]

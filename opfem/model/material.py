@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_positive
+from .._checks import as_leaf, check_finite, check_modulus, check_positive
 from .deformation import Kinematics, Tensor, identity_like, kinematics, outer, product, transpose
 
 
@@ -149,7 +149,7 @@ class MooneyRivlin(AbstractInvariantMaterial):
         check_finite("MooneyRivlin.c10", "MPa", self.c10)
         check_finite("MooneyRivlin.c01", "MPa", self.c01)
         check_positive("MooneyRivlin shear modulus 2 (c10 + c01)", "MPa", 2.0 * (self.c10 + self.c01))
-        check_positive("MooneyRivlin.bulk", "MPa", self.bulk)
+        check_modulus("MooneyRivlin.bulk", "MPa", self.bulk)
 
     def slopes(self, I1_change: Array) -> tuple[Array, Array]:
         """Return c10 and c01 [MPa]."""
@@ -179,7 +179,7 @@ class NeoHooke(AbstractInvariantMaterial):
 
     def __check_init__(self):
         check_positive("NeoHooke.c10", "MPa", self.c10)
-        check_positive("NeoHooke.bulk", "MPa", self.bulk)
+        check_modulus("NeoHooke.bulk", "MPa", self.bulk)
 
     def slopes(self, I1_change: Array) -> tuple[Array, Array]:
         """Return c10 and zero [MPa]."""
@@ -214,7 +214,7 @@ class Yeoh(AbstractInvariantMaterial):
         check_positive("Yeoh.c10", "MPa", self.c10)
         check_finite("Yeoh.c20", "MPa", self.c20)
         check_finite("Yeoh.c30", "MPa", self.c30)
-        check_positive("Yeoh.bulk", "MPa", self.bulk)
+        check_modulus("Yeoh.bulk", "MPa", self.bulk)
 
     def slopes(self, I1_change: Array) -> tuple[Array, Array]:
         """Return dψ/dĪ1 and zero [MPa] at Ī1 - 3."""

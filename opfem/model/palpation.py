@@ -1,20 +1,21 @@
 """The experiment: a layer between window and sample, its field, its mesh and its sides."""
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_positive
+from .._checks import as_leaf, check_positive, concrete
 from .contact import Bonded, Contact, Roller, Side
 from .layer import Layer
 from .mesh import LayerMesh
 
 SIDES = ("x0", "x1", "y0", "y1")
-ELEMENTS = ("mean_dilatation", "full")
+Element = Literal["mean_dilatation", "full", "reduced", "hybrid", "tet4", "tet10"]
+ELEMENTS = get_args(Element)
 
 
 class Palpation(eqx.Module):
@@ -27,7 +28,11 @@ class Palpation(eqx.Module):
         window: `Contact`, `Bonded` or `Roller` at z = 0.
         sample: The same at the sample–layer interface.
         sides: "free", "roller", or a dict of these by x0, x1, y0, y1 (missing ones are free).
-        element: "mean_dilatation" (locking-free) or "full" (plain 2×2×2).
+        element: How an element measures strain. Hexahedra: "mean_dilatation" (locking-free up to a bulk
+            modulus of about 1000 shear moduli), "hybrid" (the same with the mean stress as an unknown: any
+            bulk modulus, also `jnp.inf`), "full" (2×2×2 points; locks), "reduced" (one point with hourglass
+            control; soft in bending). Tetrahedra that divide the same box: "tet4" (six to an element; locks
+            worse than "full") and "tet10" (quadratic, six to 2×2×2 elements with their nodes: nx, ny, nz even).
         hold: What keeps a layer in place that friction cannot. None: its mean in-plane motion and
             rotation at the window are held, until friction can carry what the hold carries. A number
             [N/mm]: a uniform in-plane spring under the whole layer instead, so that it can drift.
@@ -42,7 +47,7 @@ class Palpation(eqx.Module):
     window: Side
     sample: Side
     sides: tuple[str, str, str, str] = eqx.field(static=True)
-    element: Literal["mean_dilatation", "full"] = eqx.field(static=True)
+    element: Element = eqx.field(static=True)
     hold: Array | None
 
     def __init__(
@@ -53,7 +58,7 @@ class Palpation(eqx.Module):
         window: Side,
         sample: Side,
         sides: str | Mapping[str, str] = "free",
-        element: Literal["mean_dilatation", "full"] = "mean_dilatation",
+        element: Element = "mean_dilatation",
         hold=None,
     ):
         if not isinstance(layer, Layer):
@@ -71,6 +76,14 @@ class Palpation(eqx.Module):
                 )
         if element not in ELEMENTS:
             raise ValueError(f"Palpation.element must be one of {ELEMENTS}, got {element!r}.")
+        if element == "tet10" and any(n % 2 for n in counts):
+            raise ValueError(f'Palpation.elements must be even numbers for element="tet10", got {elements!r}.')
+        bulk = concrete(layer.material.bulk)
+        if element != "hybrid" and bulk is not None and not np.all(np.isfinite(bulk)):
+            raise ValueError(
+                f"Palpation.element={element!r} needs a finite bulk modulus [MPa], got {bulk}. For an incompressible "
+                'layer pass element="hybrid".'
+            )
         if hold is not None:
             check_positive("Palpation.hold", "N/mm", hold)
         self.layer = layer

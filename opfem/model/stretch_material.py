@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_positive, concrete
+from .._checks import as_leaf, check_finite, check_modulus, check_positive, concrete
 from .deformation import Kinematics, Tensor, identity_like, product, transpose
 from .material import AbstractMaterial
 
@@ -103,7 +103,7 @@ class Ogden(AbstractStretchMaterial):
         if alpha is not None and (alpha == 0).any():
             raise ValueError(f"Ogden.alpha [-] must not be zero, got {alpha.tolist()}; leave that term out.")
         check_positive("Ogden shear modulus, the sum of mu", "MPa", self.shear)
-        check_positive("Ogden.bulk", "MPa", self.bulk)
+        check_modulus("Ogden.bulk", "MPa", self.bulk)
 
     @property
     def shear(self) -> Array:
@@ -151,7 +151,7 @@ class Hencky(AbstractStretchMaterial):
 
     def __check_init__(self):
         check_positive("Hencky.mu", "MPa", self.mu)
-        check_positive("Hencky.bulk", "MPa", self.bulk)
+        check_modulus("Hencky.bulk", "MPa", self.bulk)
 
     @property
     def shear(self) -> Array:

@@ -5,58 +5,51 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.hex8 import CORNERS, GAUSS_POINTS, assemble
 from ..mechanics.internal import layer_body
-from ..mechanics.kinematics import contract
+from ..mechanics.kinematics import CellKind, LayerCells, contract
 from ..model.deformation import identity_like, product, transpose
 from ..solvers import Solution
 
-# Values at the nodes of the trilinear field through the Gauss points: N_q at the corners `(8 nodes, 8 points)`.
-_EXTRAPOLATE = np.array(
-    [
-        [
-            np.prod([(x - other) / (own - other) for x, own, other in zip(corner, point, 1.0 - point, strict=True)])
-            for point in GAUSS_POINTS
-        ]
-        for corner in CORNERS
-    ]
-)
-
 
 class LayerFields(eqx.Module):
-    """Fields at the eight Gauss points of every element, x fastest, of the deformed layer.
+    """Fields at the points where the elements of the deformed layer measure strain.
+
+    Eight Gauss points, x fastest; one for "reduced", six for "tet4". A cell is an element, but for "tet10"
+    2 × 2 × 2 of them with 24 points.
 
     Attributes:
         deformation_gradient: F [-].
         stress: Cauchy stress [MPa], tension positive.
         energy_density: Strain energy per reference volume [MPa].
-        volume: Reference volume of each point [mm³], the same in every layer of elements.
+        volume: Reference volume of each point [mm³].
+        cells: The cells and their points.
     """
 
-    deformation_gradient: Float[Array, "3 3 8 nz ny nx"]
-    stress: Float[Array, "3 3 8 nz ny nx"]
-    energy_density: Float[Array, "8 nz ny nx"]
-    volume: Float[Array, "8 1 ny nx"]
+    deformation_gradient: Float[Array, "3 3 points cz cy cx"]
+    stress: Float[Array, "3 3 points cz cy cx"]
+    energy_density: Float[Array, "points cz cy cx"]
+    volume: Float[Array, "points _ cy cx"]
+    cells: LayerCells
 
     @property
-    def green_strain(self) -> Float[Array, "3 3 8 nz ny nx"]:
+    def green_strain(self) -> Float[Array, "3 3 points cz cy cx"]:
         """Green–Lagrange strain (FᵀF - I)/2 [-]."""
         F = self.deformation_gradient
         return 0.5 * (product(transpose(F), F) - identity_like(F))
 
-    def element_mean(self, values: Float[Array, "*components 8 nz ny nx"]) -> Float[Array, "*components nz ny nx"]:
-        """Average a field of Gauss points over the reference volume of each element.
+    def element_mean(self, values: Float[Array, "*components points cz cy cx"]) -> Float[Array, "*components nz ny nx"]:
+        """Average a field over the reference volume of each element.
 
         Args:
             values: One of the fields, or any like it.
         """
-        return jnp.sum(values * self.volume, axis=-4) / jnp.sum(self.volume, axis=0)
+        return self.cells.element_mean(values, self.volume)
 
-    def at_nodes(self, values: Float[Array, "*components 8 nz ny nx"]) -> Float[Array, "*components mz my mx"]:
-        """Recover a field at the nodes: extrapolated in each element, then averaged by reference volume.
+    def at_nodes(self, values: Float[Array, "*components points cz cy cx"]) -> Float[Array, "*components mz my mx"]:
+        """Recover a field at the nodes: extrapolated in each cell, then averaged by reference volume.
 
-        It is exact for a field that is linear in the reference position, and reaches the surfaces, where
-        an element mean lies half an element below.
+        It is exact for a field that is linear in the reference position ("reduced": constant), and reaches
+        the surfaces, where an element mean lies half an element below.
 
         Args:
             values: One of the fields, or any like it.
@@ -64,19 +57,38 @@ class LayerFields(eqx.Module):
         components = values.shape[:-4]
         flat = values.reshape(-1, *values.shape[-4:])
         share = jnp.broadcast_to(jnp.sum(self.volume, axis=0), flat.shape[-3:])
-        nodal = contract(_EXTRAPOLATE, jnp.moveaxis(flat, 1, 0)) * share
-        total = assemble(jnp.broadcast_to(share, (8, 1, *share.shape)))
-        return (assemble(nodal) / total).reshape(*components, *total.shape[1:])
+        nodal = contract(_extrapolation(self.cells.kind, flat.shape[1]), jnp.moveaxis(flat, 1, 0)) * share
+        total = self.cells.assemble(jnp.broadcast_to(share, (len(nodal), 1, *share.shape)))
+        return (self.cells.assemble(nodal) / total).reshape(*components, *total.shape[1:])
+
+
+def _extrapolation(kind: CellKind, points: int) -> np.ndarray:
+    """Build what turns values at the points of a cell into values at its nodes `(nodes, points)`.
+
+    Through eight points goes a trilinear field; through those of tetrahedra a linear one, by least squares.
+    """
+
+    def terms(at: np.ndarray) -> np.ndarray:
+        x, y, z = at.T
+        one = np.ones_like(x)
+        if points == 1:
+            return one[:, None]
+        linear = [one, x, y, z]
+        return np.stack(linear if points != 8 else [*linear, x * y, y * z, z * x, x * y * z], axis=1)
+
+    own = kind.points if points > 1 else np.full((1, 3), 0.5)
+    return terms(kind.nodes / kind.span) @ np.linalg.pinv(terms(own))
 
 
 def layer_fields(solution: Solution) -> LayerFields:
     """Compute stress, strain and energy inside the layer of a solution; NaN where the solve failed.
 
-    In `mean_dilatation` elements the mean stress is that of the element's mean volume change.
+    In "mean_dilatation" and "hybrid" elements the mean stress is the element's.
 
     Args:
         solution: What `solve` returned; works under jit, vmap and grad.
     """
     palpation = solution.palpation
     body = layer_body(palpation.mesh(), palpation.layer.material, palpation.element)
-    return LayerFields(*body.fields(solution.displacement), body.geometry.weight)
+    mean_stress = solution.last_converged.state.mean_stress
+    return LayerFields(*body.fields(solution.displacement, mean_stress), body.field_volume(), body.cells)

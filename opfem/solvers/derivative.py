@@ -14,8 +14,8 @@ from jaxtyping import Array
 from ..mechanics.boundary import Bodies
 from .equilibrium import Problem, State
 from .newton import Newton, solve_tangent
-from .stencil import Nodal
 from .stepping import Path
+from .tangent import Unknowns
 
 # Relative residual of the linear solves, in float64, and the corrections that it may take.
 _RTOL = 1e-10
@@ -44,10 +44,10 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
 
             return jax.lax.custom_linear_solve(tangent, b, solver(False), solver(True))
 
-        u = jax.lax.custom_root(
-            lambda u: slowed.balance(u, solve.fraction, state, solve.held), solve.u, lambda _, u: u, tangent_solve
+        x = jax.lax.custom_root(
+            lambda x: slowed.balance(x, solve.fraction, state, solve.held), solve.x, lambda _, x: x, tangent_solve
         )
-        return state, slowed.advance(u, solve.fraction, state, solve.held)
+        return state, slowed.advance(x, solve.fraction, state, solve.held)
 
     def step(states, slot):
         index, solve = slot
@@ -62,30 +62,31 @@ def _solve(
     state: State,
     solve: Path,
     matvec,
-    b: Nodal,
+    b: Unknowns,
     transposed: bool,
     is_known: Array,
     settings: Newton,
-) -> Nodal:
+) -> Unknowns:
     """Solve with the tangent of the balance, or its transpose, by corrections in float32; else NaN."""
-    tangent = problem.tangent(solve.u, solve.fraction, state, Bodies(), transposed)
+    tangent = problem.tangent(solve.x, solve.fraction, state, Bodies(), transposed)
 
     def correct(carry):
         x, r, count = carry
-        inside = problem.project(jnp.asarray(problem.free) * r, solve.held)
+        inside = r._replace(u=problem.project(jnp.asarray(problem.free) * r.u, solve.held))
         change = solve_tangent(problem, tangent, inside, solve.held, settings).x
-        change = problem.project(jnp.asarray(problem.free) * change, solve.held)
-        x = x + change + (r - inside) / problem.typical_stiffness
-        return x, b - matvec(x), count + 1
+        u = problem.project(jnp.asarray(problem.free) * change.u, solve.held)
+        change = change._replace(u=u + (r.u - inside.u) / problem.typical_stiffness)
+        x = jax.tree.map(jnp.add, x, change)
+        return x, jax.tree.map(jnp.subtract, b, matvec(x)), count + 1
 
     def unfinished(carry):
         _, r, count = carry
         return ~(_size(r) <= target) & (count < _MOST_CORRECTIONS)
 
     target = _RTOL * _size(b)
-    x, r, _ = jax.lax.while_loop(unfinished, correct, (jnp.zeros_like(b), b, 0))
-    return jnp.where((_size(r) <= target) & is_known, x, jnp.nan)
+    x, r, _ = jax.lax.while_loop(unfinished, correct, (jax.tree.map(jnp.zeros_like, b), b, 0))
+    return jax.tree.map(lambda v: jnp.where((_size(r) <= target) & is_known, v, jnp.nan), x)
 
 
-def _size(r: Nodal) -> Array:
-    return jnp.sqrt(jnp.vdot(r, r))
+def _size(r: Unknowns) -> Array:
+    return jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(r)))

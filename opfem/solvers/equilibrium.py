@@ -16,7 +16,8 @@ from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, 
 from ..mechanics.face import tributary_area
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
-from .stencil import Nodal, Stencil, assemble_stencil, held, with_unit_diagonal
+from .stencil import Nodal
+from .tangent import Tangent, Unknowns, VolumeCoupling, assemble_tangent
 
 
 class Supports(NamedTuple):
@@ -56,21 +57,29 @@ class State(eqx.Module):
 
     Attributes:
         u: Displacement [mm].
+        mean_stress: Mean stress of the elements [MPa] where it is an unknown of its own (`hybrid`), else None.
         fraction: Load fraction [-].
         histories: Friction history (`SlipHistory`) of the contact with each body.
         held: Whether the in-plane hold carries rigid motion.
     """
 
     u: Nodal
+    mean_stress: Float[Array, "nz ny nx"] | None
     fraction: Float[Array, ""]
     histories: Bodies
     held: Array
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What Newton's method solves for."""
+        return Unknowns(self.u, self.mean_stress)
 
 
 class Forces(NamedTuple):
     """Nodal forces on the layer [N] at one state, those of each body, and the smallest volume ratio."""
 
     internal: Nodal
+    volume: Array | None  # volume that a mean stress misses, as a force [N], where it is an unknown
     applied: Bodies  # of Touching
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
@@ -80,6 +89,7 @@ class Problem(eqx.Module):
     """A palpation and its load, discretised."""
 
     body: LayerBody
+    low_order: LayerBody | None  # elements of the same nodes that stand in for the body's in the preconditioner
     positions: Nodal
     contacts: Bodies  # of ContactFace
     dead: tuple[Array, Array] | None  # nodal force at the interface [N], at fraction 0 and 1
@@ -99,12 +109,14 @@ class Problem(eqx.Module):
         """Mask of the unknowns, 1 where free."""
         return self.supports.free(self.positions.shape[1:])
 
-    def forces(self, u: Nodal, fraction: Array, state: State) -> Forces:
+    def forces(self, x: Unknowns, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
-        internal, smallest_J = self.body.internal_force(u)
+        u, mean_stress = x
+        internal, smallest_J = self.body.internal_force(u, mean_stress)
+        volume = None if mean_stress is None else self.stress_scale * self.body.volume_residual(u, mean_stress)
         internal = internal + self._drag(self.viscosity) * _node_share(u.shape[1:]) * (u - state.u)
         spring = None if self.spring is None else -self.spring * u[:2, 0]
-        return self.with_contact(Forces(internal, Bodies(), spring, smallest_J), u, fraction, state)
+        return self.with_contact(Forces(internal, volume, Bodies(), spring, smallest_J), u, fraction, state)
 
     def with_contact(
         self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Bodies | None = None
@@ -179,32 +191,39 @@ class Problem(eqx.Module):
             unbalanced = unbalanced - put(Touching(spring, None), "window", unbalanced.shape)
         return unbalanced
 
-    def residual(self, forces: Forces, held: Array) -> Nodal:
+    def residual(self, forces: Forces, held: Array) -> Unknowns:
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
-        return self.project(jnp.asarray(self.free) * self._unbalanced(forces), held)
+        return Unknowns(self.project(jnp.asarray(self.free) * self._unbalanced(forces), held), forces.volume)
 
-    def balance(self, u: Nodal, fraction: Array, state: State, held: Array) -> Nodal:
+    def balance(self, x: Unknowns, fraction: Array, state: State, held: Array) -> Unknowns:
         """Compute the equations that a converged displacement fulfils, as many as unknowns [N].
 
         The residual of the free unknowns; a spring to the prescribed value for the others, and to the
         last state for the rigid motion that is held.
         """
+        u = x.u
         free = jnp.asarray(self.free)
-        residual = self.residual(self.forces(u, fraction, state), held)
+        residual = self.residual(self.forces(x, fraction, state), held)
         misplaced = free * (u - state.u) + (1.0 - free) * (u - self.with_imposed(u, fraction))
-        return residual + self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
+        placing = self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
+        return residual._replace(u=residual.u + placing)
 
     @property
     def typical_stiffness(self) -> Array:
         """A typical stiffness of a node [N/mm]."""
-        hx, hy = self.body.geometry.spacing
-        return self.body.material.shear * hx * hy / jnp.mean(self.body.geometry.depth)
+        hx, hy = self.body.cells.element_spacing
+        return self.body.material.shear * hx * hy / self.body.cells.element_depth
+
+    @property
+    def stress_scale(self) -> Array:
+        """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]."""
+        return self.body.material.shear / self.body.cells.element_depth
 
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
         applied = self.reactions(forces).applied
         contact = jnp.sum(applied.sample.face**2) + jnp.sum(applied.window.face**2)
-        hx, hy = self.body.geometry.spacing
+        hx, hy = self.body.cells.element_spacing
         nodes = self.positions[0, 0].size
         # Below a thousandth of the shear modulus on the whole field, forces count as none.
         floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
@@ -247,33 +266,39 @@ class Problem(eqx.Module):
             return forces.spring
         return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self._unbalanced(forces))[:2, 0]), 0.0)
 
-    def tangent(
-        self, u: Nodal, fraction: Array, state: State, laws: Bodies, transposed: bool = False
-    ) -> tuple[Stencil, Array]:
+    def tangent(self, x: Unknowns, fraction: Array, state: State, laws: Bodies, transposed: bool = False) -> Tangent:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
         Args:
-            u: Displacement [mm].
+            x: Displacement [mm], and mean stress [MPa] where it is an unknown.
             fraction: Load fraction [-].
             state: Where the increment started.
             laws: Linearised contact laws; empty for the contact's own.
-            transposed: Whether to return the transposed stencil.
-
-        Returns:
-            The exact stencil [N/mm], and the guarded element matrices for the preconditioner.
+            transposed: Whether to return the transposed tangent.
         """
-        K = _single(self.body).stiffness(_single(u))
-        K = K + _single(self._drag(self.viscosity)) * _LUMPED
+        u, mean_stress = x
+        body, low_order = _single(self.body), _single(self.low_order or self.body)
+        K = low_order.cell_stiffness(_single(u), _single(mean_stress))
+        drag = _single(self._drag(self.viscosity)) * _LUMPED
+        K = K + drag
         guarded = K
+        points = None
+        if self.low_order is not None:
+            points = body.point_tangent(_single(u))
+            K = jnp.broadcast_to(drag, K.shape)
+        volume = None
+        if mean_stress is not None:
+            volume, stiffness = self._volume_coupling(body, _single(u))
+            guarded = guarded + stiffness
         matrices = self.contacts.map(
             lambda body, face, history, law: face.stiffness_matrices(fraction, self._corners(u, body), history, law),
             state.histories,
             laws,
         )
-        for body, both in zip(Bodies._fields, matrices, strict=True):
+        for name, both in zip(Bodies._fields, matrices, strict=True):
             if both is not None:
-                K = add_matrices(K, _single(both[0]), body)
-                guarded = add_matrices(guarded, _single(both[1]), body)
+                K = add_matrices(K, _single(both[0]), name)
+                guarded = add_matrices(guarded, _single(both[1]), name)
         scale = self.typical_stiffness
         if self.spring is not None:
             K = add_matrices(K, _single(self._foundation(jnp.sum(self.spring))), "window")
@@ -282,16 +307,29 @@ class Problem(eqx.Module):
             guarded = add_matrices(
                 guarded, _single(self._foundation(1e-3 * scale * self.positions[0, 0].size)), "window"
             )
-        free = self.free
-        if not free.all():
-            K = held(K, jnp.asarray(free))
-        if transposed:
-            K = jnp.transpose(K, (0, 2, 1, 4, 3, 5, 6))
-        return with_unit_diagonal(assemble_stencil(K), scale), guarded
+        return assemble_tangent(K, guarded, self.free, scale, transposed, body.cells, points, volume)
+
+    def _volume_coupling(self, body: LayerBody, u: Nodal) -> tuple[VolumeCoupling, Array]:
+        """Couple mean stress and displacement; and the stiffness of volume for the preconditioner [N/mm]."""
+        by_node = body.volume_vectors(u)
+        volume = body.cells.volume[0]
+        guard = VOLUME_GUARD * body.material.shear
+        vectors = jnp.moveaxis(by_node, 2, 0)  # layers first
+        pairs = vectors[:, :, None, :, None] * vectors[:, None, :, None, :]
+        stiffness = (guard / volume)[:, None, None, None, None] * pairs
+        scale = _single(self.stress_scale)
+        coupling = VolumeCoupling(
+            vectors=scale * by_node * body.cells.gather(jnp.asarray(self.free, by_node.dtype)),
+            mass=scale**2 * volume,
+            compliance=1.0 / body.material.bulk,
+            guard=guard,
+            shear=body.material.shear,
+        )
+        return coupling, stiffness
 
     def _drag(self, viscosity: Array) -> Array:
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
-        return viscosity * self.body.material.shear * jnp.mean(self.body.geometry.depth)
+        return viscosity * self.body.material.shear * self.body.cells.element_depth
 
     def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 faces"]:
         """Spread an in-plane stiffness [N/mm] evenly over the faces at the window, lumped at nodes."""
@@ -300,12 +338,13 @@ class Problem(eqx.Module):
         each = stiffness / (4.0 * nx * ny) * lumped[..., None]
         return jnp.broadcast_to(each, (4, 4, 3, 3, ny * nx))
 
-    def advance(self, u: Nodal, fraction: Array, state: State, held: Array) -> State:
+    def advance(self, x: Unknowns, fraction: Array, state: State, held: Array) -> State:
         """Build the state at the end of an increment, friction history included."""
+        u = x.u
         histories = self.contacts.map(
             lambda body, face, history: face.advance(fraction, self._corners(u, body), history), state.histories
         )
-        return State(u, jnp.asarray(fraction, u.dtype), histories, held)
+        return State(u, x.mean_stress, jnp.asarray(fraction, u.dtype), histories, held)
 
     def with_imposed(self, u: Nodal, fraction: Array) -> Nodal:
         """Set the prescribed displacements."""
@@ -320,9 +359,12 @@ class Problem(eqx.Module):
         """Build the undeformed state at load fraction zero."""
         histories = self.contacts.map(lambda body, face: face.initial_history(self._take(self.positions, body)))
         u = jnp.zeros_like(self.positions)
-        return State(u, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
+        mean_stress = jnp.zeros(self.elements, u.dtype) if self.body.form == "hybrid" else None
+        return State(u, mean_stress, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
 
 
+# Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
+VOLUME_GUARD = 20.0
 # Every corner's share of its element, as an element matrix.
 _LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3))[..., None, None].astype(np.float32)
 

@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 
 class KrylovResult(NamedTuple):
     """Solution, relative residual estimate, and applications of the preconditioner."""
 
-    x: Array
+    x: PyTree
     relative_residual: Float[Array, ""]
     iterations: Array
 
@@ -31,9 +32,9 @@ class _Basis(NamedTuple):
 
 
 def fgmres(
-    operator: Callable[[Array], Array],
-    preconditioner: Callable[[Array], Array],
-    b: Array,
+    operator: Callable[[PyTree], PyTree],
+    preconditioner: Callable[[PyTree], PyTree],
+    b: PyTree,
     rtol: float | int | Array,
     basis: int,
     max_iterations: float | int | Array,
@@ -41,9 +42,9 @@ def fgmres(
     """Solve operator(x) = b to a residual of rtol × |b|.
 
     Args:
-        operator: Linear map of an array of the shape of b.
+        operator: Linear map of a PyTree of the structure of b.
         preconditioner: Approximate inverse, in any precision.
-        b: Right-hand side.
+        b: Right-hand side: a PyTree of arrays.
         rtol: Relative tolerance on the residual norm.
         basis: Directions kept before a restart.
         max_iterations: Most applications of the preconditioner; checked at restarts.
@@ -51,14 +52,15 @@ def fgmres(
     Source:
         Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 9.6.
     """
-    shape, n = b.shape, b.size
+    like, b = b, _flat(b)
+    n = b.size
     target = rtol * _norm(b)
 
     def restart(carry):
         x, r, iterations, _ = carry
         beta = _norm(r)
         start = _Basis(
-            V=jnp.zeros((basis + 1, n), b.dtype).at[0].set(r.reshape(-1) / jnp.where(beta > 0, beta, 1.0)),
+            V=jnp.zeros((basis + 1, n), b.dtype).at[0].set(r / jnp.where(beta > 0, beta, 1.0)),
             Z=jnp.zeros((basis, n), jnp.float32),
             R=jnp.eye(basis, dtype=b.dtype),
             rotations=jnp.zeros((2, basis), b.dtype),
@@ -67,14 +69,14 @@ def fgmres(
         )
         end = jax.lax.while_loop(
             lambda s: (s.j < basis) & (jnp.abs(s.g[s.j]) > target),
-            lambda s: _extend(s, operator, preconditioner, shape),
+            lambda s: _extend(s, operator, preconditioner, like),
             start,
         )
         # Columns not reached keep the identity and a zero right-hand side.
         right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
         y = _back_substitute(end.R, right)
-        x = x + (y @ end.Z).reshape(shape)
-        r = b - operator(x).astype(b.dtype)
+        x = x + y @ end.Z
+        r = b - _flat(operator(_unflat(x, like))).astype(b.dtype)
         return x, r, iterations + end.j, _norm(r)
 
     def unfinished(carry):
@@ -85,13 +87,13 @@ def fgmres(
         unfinished, restart, (jnp.zeros_like(b), b, jnp.zeros((), int), _norm(b) + target)
     )
     norm = _norm(b)
-    return KrylovResult(x, size / jnp.where(norm > 0, norm, 1.0), iterations)
+    return KrylovResult(_unflat(x, like), size / jnp.where(norm > 0, norm, 1.0), iterations)
 
 
-def _extend(s: _Basis, operator, preconditioner, shape) -> _Basis:
+def _extend(s: _Basis, operator, preconditioner, like: PyTree) -> _Basis:
     j = s.j
-    z = preconditioner(s.V[j].reshape(shape)).astype(jnp.float32)
-    w = operator(z).astype(s.V.dtype).reshape(-1)
+    z = _flat(preconditioner(_unflat(s.V[j], like))).astype(jnp.float32)
+    w = _flat(operator(_unflat(z, like))).astype(s.V.dtype)
     h = s.V @ w
     w = w - h @ s.V
     again = s.V @ w  # classical Gram–Schmidt twice is as good as modified, and two matrix products
@@ -111,7 +113,7 @@ def _extend(s: _Basis, operator, preconditioner, shape) -> _Basis:
     column = jnp.where(jnp.arange(s.R.shape[0]) < j, h[:-1], 0.0).at[j].set(radius)
     return _Basis(
         V=s.V.at[j + 1].set(w / jnp.where(size > 0, size, 1.0)),
-        Z=s.Z.at[j].set(z.reshape(-1)),
+        Z=s.Z.at[j].set(z),
         R=s.R.at[:, j].set(column),
         rotations=s.rotations.at[:, j].set(jnp.stack([c, sn])),
         g=s.g.at[j + 1].set(-sn * s.g[j]).at[j].set(c * s.g[j]),
@@ -129,3 +131,13 @@ def _back_substitute(R: Array, g: Array) -> Array:
 
 def _norm(v: Array) -> Array:
     return jnp.sqrt(jnp.vdot(v, v))
+
+
+def _flat(tree: PyTree) -> Array:
+    return jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(tree)])
+
+
+def _unflat(v: Array, like: PyTree) -> PyTree:
+    leaves, structure = jax.tree.flatten(like)
+    parts = jnp.split(v, np.cumsum([leaf.size for leaf in leaves])[:-1])
+    return jax.tree.unflatten(structure, [p.reshape(leaf.shape) for p, leaf in zip(parts, leaves, strict=True)])

@@ -17,8 +17,8 @@ from ..mechanics.boundary import Bodies
 from ..mechanics.face import FaceRule
 from .equilibrium import Forces, Problem, State
 from .krylov import KrylovResult, fgmres
-from .multigrid import apply_multigrid, build_multigrid
-from .stencil import Nodal, Stencil, apply_stencil
+from .stencil import Nodal
+from .tangent import Tangent, Unknowns, preconditioner
 
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
@@ -102,7 +102,7 @@ class IncrementResult(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    u: Nodal
+    x: Unknowns
     contact: Bodies  # of ContactIterate
     forces: Forces
     size: Array
@@ -114,12 +114,12 @@ class _Iterate(NamedTuple):
 
 
 def solve_increment(
-    problem: Problem, state: State, guess: Nodal, fraction: Array, held: Array, settings: Newton
+    problem: Problem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
 ) -> IncrementResult:
     """Find equilibrium at a load fraction, from a converged state and a first guess."""
 
-    def evaluate(u):
-        forces = problem.forces(u, fraction, state)
+    def evaluate(x):
+        forces = problem.forces(x, fraction, state)
         size = _norm(problem.residual(forces, held))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
         return forces, size, settings.rtol * problem.force_scale(forces)
@@ -133,15 +133,21 @@ def solve_increment(
 
     def step(it):
         settled = is_settled(it.size, it.tolerance) | (it.steps == 0)
-        laws = problem.tangent_laws(it.u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
-        r = problem.residual(problem.with_contact(it.forces, it.u, fraction, state, laws), held)
-        solution = solve_tangent(problem, problem.tangent(it.u, fraction, state, laws), -r, held, settings)
-        direction = problem.project(_limited(problem, solution.x, settings.step_limit), held) * problem.free
+        u = it.x.u
+        laws = problem.tangent_laws(u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
+        r = problem.residual(problem.with_contact(it.forces, u, fraction, state, laws), held)
+        tangent = problem.tangent(it.x, fraction, state, laws)
+        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
+        change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
+        direction = solution.x._replace(u=change)
+
+        def moved(length):
+            return jax.tree.map(lambda v, d: v + length * d, it.x, direction)
 
         def shorten(carry):
             length, count, *_ = carry
             length = jnp.where(count == 0, 1.0, 0.5 * length)
-            return length, count + 1, *evaluate(it.u + length * direction)
+            return length, count + 1, *evaluate(moved(length))
 
         def unusable(carry):
             return ~jnp.isfinite(carry[3]) & (carry[1] <= settings.max_backtracks)
@@ -149,8 +155,8 @@ def solve_increment(
         start = (jnp.ones_like(it.size), 0, it.forces, jnp.full_like(it.size, jnp.inf), it.tolerance)
         length, _, forces, size, tolerance = jax.lax.while_loop(unusable, shorten, start)
         return _Iterate(
-            u=it.u + length * direction,
-            contact=problem.follow(it.u, direction, fraction, state, laws, length),
+            x=moved(length),
+            contact=problem.follow(u, change, fraction, state, laws, length),
             forces=forces,
             size=size,
             tolerance=tolerance,
@@ -160,12 +166,12 @@ def solve_increment(
             unsettled=jnp.where(is_settled(size, tolerance), 0, it.unsettled + 1),
         )
 
-    u = problem.with_imposed(guess, fraction)
+    x = guess._replace(u=problem.with_imposed(guess.u, fraction))
     zero = jnp.zeros((), int)
-    first = _Iterate(u, problem.initial_iterates(state), *evaluate(u), zero, zero, zero, zero)
+    first = _Iterate(x, problem.initial_iterates(state), *evaluate(x), zero, zero, zero, zero)
     end = jax.lax.while_loop(unfinished, step, first)
     return IncrementResult(
-        state=problem.advance(end.u, fraction, state, held),
+        state=problem.advance(end.x, fraction, state, held),
         converged=end.size <= end.tolerance,
         steps=end.steps,
         krylov=end.krylov,
@@ -174,28 +180,35 @@ def solve_increment(
     )
 
 
-def solve_tangent(
-    problem: Problem, tangent: tuple[Stencil, Array], b: Nodal, held: Array, settings: Newton
-) -> KrylovResult:
-    """Solve one linear system with the tangent, on free unknowns without the held rigid motions."""
-    S, guarded = tangent
-    multigrid = build_multigrid(guarded, None if problem.free.all() else problem.free, problem.typical_stiffness)
-    return fgmres(
-        lambda v: problem.project(apply_stencil(S, problem.project(v, held)), held),
-        lambda v: problem.project(apply_multigrid(multigrid, v), held),
+def solve_tangent(problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton) -> KrylovResult:
+    """Solve one linear system with the tangent, on free unknowns without the held rigid motions.
+
+    In the result, mean stress is in MPa.
+    """
+    precondition = preconditioner(tangent, problem.free, problem.typical_stiffness)
+
+    def inside(x: Unknowns) -> Unknowns:
+        return x._replace(u=problem.project(x.u, held))
+
+    result = fgmres(
+        lambda v: inside(tangent.apply(inside(v))),
+        lambda v: inside(precondition(v)),
         b,
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,
         max_iterations=settings.krylov_steps,
     )
+    if result.x.mean_stress is None:
+        return result
+    return result._replace(x=result.x._replace(mean_stress=problem.stress_scale * result.x.mean_stress))
 
 
 def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:
     """Shorten the moves of single nodes that stand out of a step."""
     reach = jnp.sqrt(jnp.sum(change**2, axis=0))
-    longest = step_limit * jnp.min(problem.body.geometry.spacing) + 4.0 * jnp.mean(reach)
+    longest = step_limit * jnp.min(problem.body.cells.element_spacing) + 4.0 * jnp.mean(reach)
     return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))
 
 
-def _norm(r: Nodal) -> Array:
-    return jnp.sqrt(jnp.vdot(r, r))
+def _norm(r: Unknowns) -> Array:
+    return jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(r)))

@@ -37,9 +37,9 @@ class Fields(eqx.Module):
 def recover(problem: Problem, before: State, state: State, load: Load) -> Fields:
     """Recover the fields of a state, given the one its last increment started from."""
     u = state.u
-    forces = problem.reactions(problem.forces(u, state.fraction, before))
+    forces = problem.reactions(problem.forces(state.unknowns, state.fraction, before))
     hold = problem.hold_force(forces, state.held)
-    stress = problem.body.cauchy(u)[2, 2]
+    _, stress, _ = problem.body.fields(u, state.mean_stress)
     applied = forces.applied
     sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample.face)
     window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window.face)
@@ -48,16 +48,14 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         "force_sample": applied.sample.total,
         "force_window": applied.window.total,
         "force_hold": jnp.concatenate([jnp.sum(hold, axis=(1, 2)), jnp.zeros(1, u.dtype)]),
-        "strain_energy": problem.body.energy(u),
+        "strain_energy": problem.body.energy(u, state.mean_stress),
         "friction_dissipation": sum(dissipated, start=jnp.zeros((), u.dtype)),
         "approach": sample_stats["approach"],
         "max_penetration": jnp.maximum(sample_stats["max_penetration"], window_stats["max_penetration"]),
         "min_volume_ratio": forces.smallest_J,
     }
-    top = stress[:, -1]
-    weight = problem.body.geometry.weight[:, 0]
-    mean = jnp.sum(top * weight, axis=0) / jnp.sum(weight, axis=0)
-    return Fields(sample, window, _thickness(problem, u, load), mean, stats)
+    top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
+    return Fields(sample, window, _thickness(problem, u, load), top, stats)
 
 
 def _face(

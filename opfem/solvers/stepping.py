@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from .equilibrium import Forces, Problem, State
 from .newton import Newton, solve_increment
 from .solution import RESULTS
+from .tangent import Unknowns
 
 # Friction takes over from the hold when it can carry the hold's force with this much to spare.
 _RELEASE_MARGIN = 0.5
@@ -44,7 +45,7 @@ _BALANCED = 1e-4
 class Path(NamedTuple):
     """The solves that led to a state, one after the other, in arrays of fixed length."""
 
-    u: Float[Array, "n 3 mz my mx"]
+    x: Unknowns
     fraction: Float[Array, " n"]
     held: Bool[Array, " n"]
     viscosity: Float[Array, " n"]
@@ -102,8 +103,8 @@ def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
     """Start at a converged state."""
     dtype = state.u.dtype
     none, zero, no = jnp.zeros((), int), jnp.zeros((), dtype), jnp.asarray(False)
-    slots = settings.max_path
-    path = Path(jnp.zeros((slots, *state.u.shape), dtype), *(jnp.zeros(slots, t) for t in (dtype, bool, dtype)))
+    slot = Path(state.unknowns, zero, no, zero)
+    path = jax.tree.map(lambda v: jnp.zeros((settings.max_path, *v.shape), v.dtype), slot)
     return Stepping(
         state=state,
         before=state,
@@ -144,7 +145,9 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     snapping = (s.viscosity > 0) | (s.origin.fraction > s.state.fraction)
     span = s.state.fraction - s.before.fraction
     ahead = jnp.where((span > 0) & ~snapping, increment / jnp.where(span > 0, span, 1.0), 0.0)
-    guess = s.origin.u + ahead * problem.project(s.state.u - s.before.u, held)
+    moved = jax.tree.map(jnp.subtract, s.state.unknowns, s.before.unknowns)
+    moved = moved._replace(u=problem.project(moved.u, held))
+    guess = jax.tree.map(lambda v, d: v + ahead * d, s.origin.unknowns, moved)
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, s.viscosity)
     on_the_way = (_VISCOUS_RTOL, _VISCOUS_STEPS)
     limits = [
@@ -175,6 +178,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     length = jnp.where(moves_on, s.length + 1, jnp.where(goes_on, s.length, s.kept))
     can_release, slides = _hold_balance(problem, result.forces, result.state)
     attempts = s.attempts + 1
+    solved = Path(result.state.unknowns, fraction, held, s.viscosity)
     return Stepping(
         state=state,
         before=before,
@@ -193,7 +197,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         slides=jnp.where(accepted, slides, s.slides),
         failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
         fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
-        path=None if s.path is None else _recorded(s, moves_on, Path(result.state.u, fraction, held, s.viscosity)),
+        path=None if s.path is None else _recorded(s, moves_on, solved),
         length=length,
         kept=jnp.where(accepted, length, s.kept),
     )

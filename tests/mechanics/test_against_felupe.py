@@ -31,7 +31,7 @@ MATERIALS = {
     ),
 }
 _force = eqx.filter_jit(lambda body, u: body.internal_force(u)[0])
-_stiffness = eqx.filter_jit(lambda body, u: body.stiffness(u))
+_stiffness = eqx.filter_jit(lambda body, u: body.cell_stiffness(u))
 
 
 def felupe_mesh(X):

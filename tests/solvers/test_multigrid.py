@@ -144,7 +144,7 @@ def layer_stiffness(elements, extent=(5.0, 4.0), thickness=0.5):
     return np.asarray(_stiffness_at_rest(body, jnp.zeros((3, *node_shape(elements)))))
 
 
-_stiffness_at_rest = eqx.filter_jit(lambda body, u: body.stiffness(u))
+_stiffness_at_rest = eqx.filter_jit(lambda body, u: body.cell_stiffness(u))
 
 
 def rollers(elements, bonded):
