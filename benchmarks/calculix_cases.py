@@ -1,9 +1,9 @@
 """Every stored CalculiX case, solved by opfem: force, energy, displacements, stress, with the difference of each.
 
-Run `python -m benchmarks.calculix_cases SHARED [--only PATTERN] [--element full mean_dilatation] [--refine]`
-in the repository's root. SHARED is the folder that holds reference/ccx/cases. Prints one JSON line per figure
-and then the table; `--refine` instead solves the problems of prescribed displacement on finer and finer meshes,
-which shows where both element forms, and CalculiX's other elements, go.
+Run `python -m benchmarks.calculix_cases SHARED [--only PATTERN] [--element full mean_dilatation]` in the
+repository's root. SHARED is the folder that holds reference/ccx/cases. Prints one JSON line per figure and then
+the table. With `--refine [--elements 8 16 32]` it instead solves the problems of prescribed displacement on
+finer and finer meshes, which shows where both element forms, and CalculiX's other elements, go.
 """
 
 import argparse
@@ -212,28 +212,28 @@ def coin_uz(shared: Path, n: int) -> np.ndarray:
     return cases.nodal_map(cases.load_case(shared, name)[0], 2, n)
 
 
-def refinement(shared: Path, pattern: str, elements: list[str]) -> None:
+def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int] | None) -> None:
     """Solve the problems of prescribed displacement on finer and finer meshes; print every figure and its limit."""
     coin = {"coin_slip": (False, 0.11732), "coin_slip_k200": (False, 1.1732), "coin_bonded": (True, 0.11732)}
-    problems = {
-        f"fam_{v}": ((8, 16, 24, 32, 48), partial(cases.formula_family, v), (8, 16, 32)) for v in ("B1", "B2", "B3")
-    } | {
-        name: ((20, 40, 80), lambda n, element, about=about: prescribed_coin(coin_uz(shared, n), *about, element), None)
-        for name, about in coin.items()
-    }
+    problems = {f"fam_{v}": ((8, 16, 24, 32, 48), partial(cases.formula_family, v)) for v in ("B1", "B2", "B3")}
+    for name, about in coin.items():
+        problems[name] = (
+            (20, 40, 80),
+            lambda n, element, about=about: prescribed_coin(coin_uz(shared, n), *about, element),
+        )
     for name in fnmatch.filter(problems, pattern):
-        meshes, state, halvings = problems[name]
+        usual, state = problems[name]
         for element in elements:
             found = {}
-            for n in meshes:
+            for n in meshes or usual:
                 solution = op.solve(*state(n, element), progress=False)
                 values = described(solution, name)
                 found[n] = {quantity: values[quantity] for quantity in UNITS if np.ndim(values.get(quantity, [])) == 0}
                 print(json.dumps({"problem": name, "element": element, "n": n} | found[n]), flush=True)
                 jax.clear_caches()
-            three = halvings or meshes
-            limits = {quantity: limit(*(found[n][quantity] for n in three)) for quantity in found[three[0]]}
-            print(json.dumps({"problem": name, "element": element, "limit_of": three} | limits), flush=True)
+            for three in [(n, 2 * n, 4 * n) for n in found if {2 * n, 4 * n} <= set(found)]:
+                limits = {quantity: limit(*(found[n][quantity] for n in three)) for quantity in found[three[0]]}
+                print(json.dumps({"problem": name, "element": element, "limit_of": three} | limits), flush=True)
 
 
 def limit(coarse: float, middle: float, fine: float) -> float:
@@ -249,10 +249,11 @@ def main() -> None:
     parser.add_argument(
         "--refine", action="store_true", help="refine instead: fam_B1, …, coin_slip, coin_slip_k200, coin_bonded"
     )
+    parser.add_argument("--elements", type=int, nargs="+", help="meshes of the refinement, elements per side")
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if chosen.refine:
-        refinement(chosen.shared, chosen.only, chosen.element)
+        refinement(chosen.shared, chosen.only, chosen.element, chosen.elements)
         return
     names = [path.stem for path in (chosen.shared / "reference" / "ccx" / "cases").glob("*.json")]
     names = fnmatch.filter(names, chosen.only)

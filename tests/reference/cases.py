@@ -67,11 +67,12 @@ def imprint_map(case: dict[str, np.ndarray]) -> op.ThicknessMap:
 
 
 def nodal_map(case: dict[str, np.ndarray], component: int, n: int) -> np.ndarray:
-    """Arrange one displacement component of the interface nodes as a map `(n+1, n+1)`."""
-    nodes = case["nodes"][case["top_nodes"]]
-    column, row = (np.rint(nodes[:, k] * n / FIELD).astype(int) for k in (0, 1))
+    """Arrange one displacement component of the interface's corner nodes as a map `(n+1, n+1)`."""
+    place = case["nodes"][case["top_nodes"], :2] * n / FIELD
+    corner = np.all(np.abs(place - np.rint(place)) < 1e-6, axis=1)  # quadratic elements have nodes between
+    column, row = np.rint(place[corner]).astype(int).T
     values = np.zeros((n + 1, n + 1))
-    values[row, column] = case["u"][case["top_nodes"], component]
+    values[row, column] = case["u"][case["top_nodes"][corner], component]
     return values
 
 
