@@ -6,7 +6,6 @@ nodal values; assembling gathers too, from a padded table of the cells around ea
 
 from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from .._checks import concrete
 from ..model.deformation import cofactor
 from .hex8 import GAUSS_POINTS, GRADIENTS
+from .kinematics import AbstractCells
 from .tet import FOUR_POINTS, linear_gradients, quadratic_gradients
 
 CellKind = Literal["hex8", "tet4", "tet10"]
@@ -29,7 +29,7 @@ _POINT_VOLUME = {"hex8": 1.0 / len(GAUSS_POINTS), "tet4": 1.0 / 6.0, "tet10": 1.
 _LISTED = 8
 
 
-class UnstructuredCells(eqx.Module):
+class UnstructuredCells(AbstractCells):
     """Cells, their integration points, and who shares a node with whom.
 
     Attributes:

@@ -11,6 +11,14 @@ import numpy as np
 CORNERS = np.array([(x, y, z) for z, y, x in itertools.product((0, 1), repeat=3)])
 # Corners of the faces of a hexahedron, right-handed about the outward normal: x0, x1, y0, y1, z0, z1.
 FACES = np.array([(0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6)])
+# Six tetrahedra of a unit cube, from (0, 0, 0) to (1, 1, 1) along its edges; odd orders of the axes are turned.
+KUHN = [
+    np.array([v[k] for k in ((0, 1, 2, 3) if np.linalg.det(np.diff(v, axis=0)) > 0 else (0, 2, 1, 3))])
+    for v in (
+        np.concatenate([np.zeros((1, 3), int), np.cumsum(np.eye(3, dtype=int)[list(order)], axis=0)])
+        for order in itertools.permutations(range(3))
+    )
+]
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
@@ -79,20 +87,25 @@ def cook(n):
     return np.stack([48 * s, 44 * s + t * (44 - 28 * s), z]), cells
 
 
-def quarter_disc(core, inward, radii, z, same_area=True):
+def polygon_radius(core):
+    """Distance of the corners of a polygon with the area of the unit circle, 2 × core corners to a quarter."""
+    step = np.pi / (4 * core)
+    return np.sqrt(step / np.sin(step))
+
+
+def quarter_disc(core, inward, radii, z):
     """A quarter disc about z: a square core, blends out to the first radius, circles beyond.
+
+    Circles are polygons of the same area, so their nodes lie a little outside.
 
     Args:
         core: Cells along a side of the core; there are twice as many along an arc.
         inward: Positions between core (0) and the first radius (1), ascending, without the ends.
         radii: Radii of the circles, ascending.
         z: Heights of the planes.
-        same_area: Move the nodes of every circle out, so that its polygon has the circle's area.
     """
     angles = np.linspace(0, np.pi / 2, 2 * core + 1)
-    step = angles[1]
-    stretch = np.sqrt(step / np.sin(step)) if same_area else 1.0
-    circle = stretch * np.stack([np.cos(angles), np.sin(angles)])
+    circle = polygon_radius(core) * np.stack([np.cos(angles), np.sin(angles)])
     side, corner = 0.5 * radii[0], 0.4 * radii[0]
     s = np.linspace(0, 1, core + 1)
     t, s = np.meshgrid(s, s, indexing="ij")
@@ -153,6 +166,11 @@ def tetrahedra(points, cells):
     # From outside the face turns left, so the centre lies behind it: swap two vertices.
     tets = np.concatenate(tets)[:, [1, 0, 2, 3]]
     return merged(np.concatenate([points, centres, middles], axis=1), tets)
+
+
+def divided(cells):
+    """Split every hexahedron of a grid in six along its diagonal; the nodes stay."""
+    return np.concatenate([cells[:, vertices @ (1, 2, 4)] for vertices in KUHN])
 
 
 def quadratic(points, tets):

@@ -1,0 +1,133 @@
+"""The linear system of the hybrid form: displacement and the cells' mean stress, solved together.
+
+    [ A  Bᵀ    ] [du]   [ru]
+    [ B -M/κ   ] [dp] = [rp]
+
+A is the stiffness at constant mean stress, B the derivative of the cells' volume and M = diag(V). The bulk
+modulus κ may be infinite. Adding γ Bᵀ M⁻¹ times the second row to the first changes no solution; the first block
+becomes A + γ Bᵀ M⁻¹ B, which a moderate γ, whatever κ is, makes stiff enough in volume for a diagonal to stand in
+for the Schur complement. Flexible GMRES removes what is left.
+
+Source: Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, section 10.4; Saad, Iterative Methods, algorithm 9.6.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+# Symmetric minimum degree halves the fill-in of the default ordering; its pivots stay on the diagonal when they can.
+_ORDERING = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.01, "options": {"SymmetricMode": True}}
+
+
+class LinearSolution(NamedTuple):
+    """Displacement [mm], mean stress [MPa], applications of the preconditioner, and whether it converged."""
+
+    u: np.ndarray
+    mean_stress: np.ndarray
+    iterations: int
+    converged: bool
+
+
+def factorised(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
+    """Factorise a sparse matrix; return the function that solves with it.
+
+    Raises:
+        RuntimeError: If the matrix is singular.
+    """
+    return splu(matrix, **_ORDERING).solve
+
+
+class SaddlePoint:
+    """The system above with one factorisation, for several right-hand sides.
+
+    Args:
+        augmented: A + γ Bᵀ M⁻¹ B of the free displacements [N/mm].
+        volume: B, `(cells, free displacements)` [mm²].
+        cell_volume: Diagonal of M [mm³].
+        inverse_bulk: 1/κ [1/MPa], zero if incompressible.
+        shear: Shear modulus [MPa].
+        penalty: γ [MPa].
+    """
+
+    def __init__(
+        self,
+        augmented: csc_array,
+        volume: csc_array,
+        cell_volume: np.ndarray,
+        inverse_bulk: float,
+        shear: float,
+        penalty: float,
+    ):
+        self.augmented, self.volume, self.transposed = augmented, volume.tocsr(), volume.T.tocsr()
+        self.cell_volume, self.inverse_bulk, self.penalty = cell_volume, inverse_bulk, penalty
+        self._invert = factorised(augmented)
+        # What is left of Bᵀ beside its share in the augmented block, and the Schur complement -V × this.
+        self._coupling = 1.0 - penalty * inverse_bulk
+        self._compliance = inverse_bulk + self._coupling / (penalty + shear)
+        # Rows are measured in square roots of energy, whatever the units.
+        rows = np.abs(augmented.diagonal()), cell_volume / (penalty + shear)
+        self._scale = 1.0 / np.sqrt(np.concatenate(rows))
+
+    def solve(self, ru: np.ndarray, rp: np.ndarray, rtol: float, max_iterations: int) -> LinearSolution:
+        """Solve for one right-hand side to a residual of rtol, relative."""
+        b = np.concatenate([ru + self.penalty * (self.transposed @ (rp / self.cell_volume)), rp])
+        x, iterations, converged = flexible_gmres(
+            lambda x: self._scale * self._apply(x),
+            lambda r: self._precondition(r / self._scale),
+            self._scale * b,
+            rtol,
+            max_iterations,
+        )
+        return LinearSolution(x[: ru.size], x[ru.size :], iterations, converged)
+
+    def _apply(self, x: np.ndarray) -> np.ndarray:
+        u, p = np.split(x, [x.size - self.cell_volume.size])
+        first = self.augmented @ u + self._coupling * (self.transposed @ p)
+        return np.concatenate([first, self.volume @ u - self.inverse_bulk * self.cell_volume * p])
+
+    def _precondition(self, r: np.ndarray) -> np.ndarray:
+        ru, rp = np.split(r, [r.size - self.cell_volume.size])
+        p = -rp / (self.cell_volume * self._compliance)
+        u = self._invert(ru - self._coupling * (self.transposed @ p))
+        return np.concatenate([u, p])
+
+
+def flexible_gmres(
+    operator: Callable[[np.ndarray], np.ndarray],
+    preconditioner: Callable[[np.ndarray], np.ndarray],
+    b: np.ndarray,
+    rtol: float,
+    max_iterations: int,
+) -> tuple[np.ndarray, int, bool]:
+    """Solve operator(x) = b without restart, on the host.
+
+    Returns:
+        x, applications of the preconditioner, and whether |b - operator(x)| ≤ rtol |b|.
+    """
+    target = rtol * np.linalg.norm(b)
+    if not np.linalg.norm(b) > 0.0:
+        return np.zeros_like(b), 0, bool(np.all(np.isfinite(b)))
+    V, Z = [b / np.linalg.norm(b)], []
+    H = np.zeros((max_iterations + 1, max_iterations))
+    y = np.zeros(0)
+    size = np.inf
+    for j in range(max_iterations):
+        Z.append(preconditioner(V[j]))
+        w = operator(Z[j])
+        for _ in range(2):  # Gram–Schmidt twice keeps the basis orthogonal
+            h = np.array([v @ w for v in V])
+            w = w - sum(c * v for c, v in zip(h, V, strict=True))
+            H[: j + 1, j] += h
+        H[j + 1, j] = np.linalg.norm(w)
+        start = np.zeros(j + 2)
+        start[0] = np.linalg.norm(b)
+        y = np.linalg.lstsq(H[: j + 2, : j + 1], start, rcond=None)[0]
+        size = np.linalg.norm(start - H[: j + 2, : j + 1] @ y)
+        if size <= target or not np.isfinite(size) or H[j + 1, j] == 0.0:
+            break
+        V.append(w / H[j + 1, j])
+    x = sum((c * z for c, z in zip(y, Z, strict=True)), start=np.zeros_like(b))
+    return x, len(Z), bool(np.linalg.norm(b - operator(x)) <= 2.0 * target)
