@@ -8,7 +8,7 @@ modulus κ may be infinite. Adding γ Bᵀ M⁻¹ times the second row to the fi
 becomes A + γ Bᵀ M⁻¹ B, which a moderate γ, whatever κ is, makes stiff enough in volume for a diagonal to stand in
 for the Schur complement. Flexible GMRES removes what is left.
 
-Source: Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, section 10.4; Saad, Iterative Methods, algorithm 9.6.
+Source: Benzi & Olshanskii, SIAM J. Sci. Comput. 28 (2006) 2095; Saad, Iterative Methods, algorithm 9.6.
 """
 
 from collections.abc import Callable
