@@ -64,7 +64,8 @@ def statement(shared: Path, name: str, element: str) -> tuple[op.Palpation, op.D
     if name.startswith("coin_presc"):
         n = {800: 20, 6400: 40, 51200: 80}[len(case["elems"])]
         bonded = about["bottom"] == "bonded"
-        return prescribed_coin(cases.nodal_map(case, 2, n), bonded, about["material"]["K"], element)
+        spring = None if bonded else about["options"]["spring"] * (n + 1) ** 2  # N/mm, under every window node
+        return prescribed_coin(cases.nodal_map(case, 2, n), bonded, about["material"]["K"], element, spring)
     friction, stiffness = about["friction"], 10.0
     if name.startswith("fricsim"):
         nodes = case["nodes"]
@@ -92,12 +93,14 @@ def statement(shared: Path, name: str, element: str) -> tuple[op.Palpation, op.D
     return palpation, op.Imprint(surface)
 
 
-def prescribed_coin(uz: np.ndarray, bonded: bool, bulk: float, element: str) -> tuple[op.Palpation, op.Displacement]:
+def prescribed_coin(
+    uz: np.ndarray, bonded: bool, bulk: float, element: str, spring: float | None = None
+) -> tuple[op.Palpation, op.Displacement]:
     """State the coin as a prescribed displacement of the interface."""
     n = len(uz) - 1
     side = op.Bonded() if bonded else op.Roller()
     palpation = op.Palpation(
-        cases.layer(bulk=bulk), (cases.FIELD, cases.FIELD), (n, n, n // 10), side, side, element=element
+        cases.layer(bulk=bulk), (cases.FIELD, cases.FIELD), (n, n, n // 10), side, side, element=element, hold=spring
     )
     return palpation, op.Displacement(uz, lateral="fixed" if bonded else "free")
 
