@@ -42,6 +42,35 @@ def quadrature(rule: FaceRule) -> Quadrature:
     return Quadrature(N, np.stack([d_xi, d_eta], axis=1), (wy * wx).ravel())
 
 
+def node_shares(cells: str, elements: tuple[int, int]) -> np.ndarray | None:
+    """Compute what the corners of each face stand for, over a quarter of it: `(4, ny, nx)`.
+
+    The nodal forces of a uniform pressure on triangles: linear ones have the diagonal of `kuhn_tetrahedra`;
+    on quadratic ones the middles carry all, the vertices nothing.
+
+    Args:
+        cells: "hex8" (None: all alike), "tet4" or "tet10".
+        elements: Faces (ny, nx).
+    """
+    if cells == "hex8":
+        return None
+    if cells == "tet4":
+        return np.broadcast_to([[[4 / 3 if x == y else 2 / 3]] for x, y in CORNERS], (4, *elements)).copy()
+    row, column = np.indices(elements)
+    return np.stack([np.where((row + y) % 2 + (column + x) % 2 == 0, 0.0, 4 / 3) for x, y in CORNERS])
+
+
+def filled_vertices(values: Float[Array, "*c my mx"], cells: str) -> Float[Array, "*c my mx"]:
+    """Put the sum of the neighbours at nodes that stand for no area: the vertices of quadratic triangles."""
+    if cells != "tet10":
+        return values
+    my, mx = values.shape[-2:]
+    row, column = np.indices((my, mx))
+    around = jnp.pad(values, [(0, 0)] * (values.ndim - 2) + [(1, 1), (1, 1)])
+    neighbours = around[..., :-2, 1:-1] + around[..., 2:, 1:-1] + around[..., 1:-1, :-2] + around[..., 1:-1, 2:]
+    return jnp.where((row % 2 == 0) & (column % 2 == 0), neighbours, values)
+
+
 def gather_face(values: Float[Array, "c my mx"]) -> Float[Array, "4 c ny nx"]:
     """Collect the nodal values of every face."""
     ny, nx = values.shape[1] - 1, values.shape[2] - 1
@@ -80,16 +109,23 @@ def area_vector(xi: Float[Array, "3 *points"], eta: Float[Array, "3 *points"]) -
     return jnp.stack([xi[(k + 1) % 3] * eta[(k + 2) % 3] - xi[(k + 2) % 3] * eta[(k + 1) % 3] for k in range(3)])
 
 
-def nodal_area_vector(x: Float[Array, "3 my mx"]) -> Float[Array, "3 my mx"]:
+def nodal_area_vector(x: Float[Array, "3 my mx"], cells: str = "hex8") -> Float[Array, "3 my mx"]:
     """Integrate n da against the nodal shape functions [mm²]."""
-    _, xi, eta = surface_tangents(gather_face(x), "gauss2")
-    return to_nodes(jnp.moveaxis(area_vector(xi, eta), 1, 0), "gauss2")
+    my, mx = x.shape[1:]
+    shares = node_shares(cells, (my - 1, mx - 1))
+    rule: FaceRule = "gauss2" if shares is None else "nodes"
+    _, xi, eta = surface_tangents(gather_face(x), rule)
+    vector = jnp.moveaxis(area_vector(xi, eta), 1, 0)
+    return to_nodes(vector if shares is None else vector * shares[:, None], rule)
 
 
-def tributary_area(x: Float[Array, "3 my mx"]) -> Float[Array, "my mx"]:
+def tributary_area(x: Float[Array, "3 my mx"], cells: str = "hex8") -> Float[Array, "my mx"]:
     """Compute each node's share of the area [mm²], lumped at the nodes."""
+    my, mx = x.shape[1:]
+    shares = node_shares(cells, (my - 1, mx - 1))
     _, xi, eta = surface_tangents(gather_face(x), "nodes")
-    return to_nodes(size(area_vector(xi, eta)), "nodes")
+    area = size(area_vector(xi, eta))
+    return to_nodes(area if shares is None else area * shares, "nodes")
 
 
 def size(v: Float[Array, "3 *points"]) -> Float[Array, "*points"]:

@@ -142,6 +142,7 @@ class ContactFace(eqx.Module):
         above: True for the sample, False for the window.
         rule: Where contact is integrated.
         sides: Which faces are sides, pushed only where they have turned towards the surface; None: none.
+        shares: What each point stands for where the points of a face are not alike (`node_shares`).
     """
 
     contact: Contact
@@ -153,6 +154,7 @@ class ContactFace(eqx.Module):
     above: bool = eqx.field(static=True)
     rule: FaceRule = eqx.field(static=True)
     sides: Bool[Array, " *faces"] | None = None
+    shares: Float[Array, "points *faces"] | None = None
 
     def initial_history(self, x: Corners) -> SlipHistory:
         """Build the history of a face that has not slipped."""
@@ -261,6 +263,10 @@ class ContactFace(eqx.Module):
 
     def _area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
         """Compute the area per unit of (ξ, η) that the surface pushes on [mm²]."""
+        area = self._whole_area(tangents)
+        return area if self.shares is None else area * self.shares
+
+    def _whole_area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
         if self.imposed is not None:
             return self.imposed.area
         area = area_vector(tangents[0], tangents[1])

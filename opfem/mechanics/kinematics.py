@@ -124,7 +124,7 @@ class LayerCells(AbstractCells):
     """
 
     spacing: Float[Array, "2"]
-    depth: Float[Array, "points 1 ny nx"]
+    depth: Float[Array, "points _ ny nx"]
     slope_x: Float[Array, "points nz ny nx"]
     slope_y: Float[Array, "points nz ny nx"]
     name: str = eqx.field(static=True, default="hex8")
@@ -135,7 +135,7 @@ class LayerCells(AbstractCells):
         return CELLS[self.name]
 
     @property
-    def weight(self) -> Float[Array, "points 1 ny nx"]:
+    def weight(self) -> Float[Array, "points _ ny nx"]:
         """Reference volume of the points [mm³]."""
         return self.depth * (self.spacing[0] * self.spacing[1] * self.kind.weights[:, None, None, None])
 

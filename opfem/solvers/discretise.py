@@ -8,9 +8,9 @@ from jaxtyping import Array, ArrayLike
 
 from .._checks import concrete
 from ..mechanics.boundary import Bodies, is_side, take
-from ..mechanics.face import FaceRule, area_vector, gather_face, size, surface_tangents, tributary_area
+from ..mechanics.face import FaceRule, area_vector, gather_face, node_shares, size, surface_tangents, tributary_area
 from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
-from ..mechanics.internal import layer_body
+from ..mechanics.internal import ELEMENT_FORMS, layer_body
 from ..model import (
     Bonded,
     Contact,
@@ -45,18 +45,25 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         bulk = jnp.minimum(bulk, VOLUME_GUARD * material.shear)
     stiffness = (bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
 
+    nx, ny, nz = mesh.elements
+    cells, _ = ELEMENT_FORMS[palpation.element]
+    shares = node_shares(cells, (ny, nx))
+    if shares is not None:  # what triangles carry is known at their nodes
+        rule = "nodes"
+        shares = jnp.asarray(shares.reshape(4, -1), X.dtype)
+
     def face(
         contact, surface: RigidSurface, above: bool, offset: ArrayLike = 0.0, imposed=None, rule: FaceRule = rule
     ) -> ContactFace:
-        return ContactFace(
-            contact, surface, jnp.asarray(offset, X.dtype), imposed, mesh.element_size, stiffness, above, rule
-        )
+        offset = jnp.asarray(offset, X.dtype)
+        return ContactFace(contact, surface, offset, imposed, mesh.element_size, stiffness, above, rule, shares=shares)
 
     def with_sides(face: ContactFace | None) -> ContactFace | None:
         if face is None or face.imposed is not None or palpation.sides == ("roller",) * 4:
             return face
-        nx, ny, nz = mesh.elements
-        return dataclasses.replace(face, sides=jnp.asarray(is_side((nz, ny, nx))))
+        sides = jnp.asarray(is_side((nz, ny, nx)))
+        whole = None if shares is None else jnp.pad(shares, ((0, 0), (0, sides.size - ny * nx)), constant_values=1.0)
+        return dataclasses.replace(face, sides=sides, shares=whole)
 
     plane = RigidSurface(None, None)
     window = face(palpation.window, plane, False) if isinstance(palpation.window, Contact) else None
@@ -65,7 +72,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         offset = _contact(palpation.sample).law.zero_pressure_clearance
         sample = face(palpation.sample, _imprint_surface(palpation, mesh, load, start), True, offset)
     elif isinstance(load, Traction):
-        area = tributary_area(X[:, -1])
+        area = tributary_area(X[:, -1], cells)
         first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
         if load.lateral is None:
@@ -78,7 +85,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         imposed = (first, last)
     spring = None
     if palpation.hold is not None:
-        share = tributary_area(X[:, 0])
+        share = tributary_area(X[:, 0], cells)
         spring = palpation.hold * share / jnp.sum(share)
     body = layer_body(mesh, material, palpation.element)
     # Multigrid is made for the stencil of hexahedra; theirs stands in for quadratic elements.

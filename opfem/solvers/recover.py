@@ -9,6 +9,7 @@ from ..measurement import ThicknessMap
 from ..mechanics.boundary import Body, take, to_touching
 from ..mechanics.face import (
     area_vector,
+    filled_vertices,
     nodal_area_vector,
     size,
     surface_tangents,
@@ -65,10 +66,15 @@ def _face(
     level = 0 if body == "window" else -1
     X, u = problem.positions[:, level], state.u[:, level]
     x = X + u
-    area = nodal_area_vector(x)
+    cells = problem.body.cells.name
+
+    def filled(values):
+        return filled_vertices(values, cells)
+
+    force, area = filled(force), filled(nodal_area_vector(x, cells))
     outward = area if body == "sample" else -area
     pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
-    traction = force / tributary_area(X)
+    traction = force / filled(tributary_area(X, cells))
     zero = jnp.zeros((), x.dtype)
     if face is None:
         sticks = support == "bonded"
@@ -80,10 +86,11 @@ def _face(
     position, xi, eta = surface_tangents(corners, face.rule)
 
     def on_nodes(values):
-        return to_touching(to_corners(values, face.rule), problem.elements).face
+        return filled(to_touching(to_corners(values, face.rule), problem.elements).face)
 
     point = face.at_points(state.fraction, position, old)
     weight = size(area_vector(xi, eta))
+    weight = weight if face.shares is None else weight * face.shares[:, : weight.shape[1]]
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
     share = on_nodes(jnp.stack([weight, load, load * point.sliding], axis=1))
     status = jnp.where(share[1] > 0, jnp.where(share[2] > 0.5 * share[1], SLIP, STICK), OPEN)

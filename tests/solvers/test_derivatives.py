@@ -56,9 +56,9 @@ def contacts(numbers: Numbers) -> dict[str, op.Contact]:
     }
 
 
-def frictional_imprint(numbers: Numbers) -> op.Solution:
+def frictional_imprint(numbers: Numbers, element: str = "mean_dilatation") -> op.Solution:
     layer = op.Layer(numbers["L0"], op.MooneyRivlin(numbers["c10"], numbers["c01"], numbers["bulk"]))
-    palpation = op.Palpation(layer, numbers["extent"], (8, 8, 2), **contacts(numbers))
+    palpation = op.Palpation(layer, numbers["extent"], (8, 8, 2), **contacts(numbers), element=element)
     return op.solve(palpation, op.Imprint(op.ThicknessMap(numbers["map"], extent=SIZE)), ACCURATE)
 
 
@@ -113,8 +113,12 @@ CASES = {
     ),
     "preload, approach taken out": Case(corrected_and_continued, {"c10": 2.2e-3, "map": bump(21), **CONTACT}),
 }
+for element in ("hybrid", "tet10"):
+    CASES[element] = Case(partial(frictional_imprint, element=element), FRICTIONAL)
 CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
-SLOW = {name: [pytest.mark.slow] for name in ("preload, approach taken out", "displacement on a spring")}
+SLOW = {
+    name: [pytest.mark.slow] for name in ("preload, approach taken out", "displacement on a spring", "hybrid", "tet10")
+}
 
 
 @partial(jax.jit, static_argnums=0)
