@@ -49,6 +49,18 @@ def solved(monkeypatch, solution):
     return calls
 
 
+def test_incompressible_layer(tmp_path, map_file, solved, capsys):
+    layer = ("--c10", 2e-3, "--c01", 7e-4, "--bulk", "inf", "--element", "hybrid")
+    assert opfem("palpate", map_file, *SMALL, *layer, "--out", tmp_path / "a") == 0
+    ((palpation, _, _),) = solved
+    assert palpation.element == "hybrid"
+    assert np.isinf(palpation.layer.material.bulk)
+    assert "incompressible" in capsys.readouterr().out
+    # JSON knows no infinite number.
+    written = json.loads((tmp_path / "a" / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert written["settings"]["bulk"] == "inf"
+
+
 def test_palpate_from_map_to_files(tmp_path, map_file, capsys):
     out = tmp_path / "new" / "stress"
     assert opfem("palpate", map_file, *SMALL, "--out", out) == 0

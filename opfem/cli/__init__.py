@@ -5,6 +5,7 @@ It reads, solves and writes with the same public functions as a notebook, and sa
 
 import dataclasses
 import json
+import math
 import os
 import sys
 import tempfile
@@ -309,7 +310,9 @@ def _settings(
     """Collect what was asked for and what was assumed, for summary.json."""
     given = {name: value for part in (reading, layer, contact) for name, value in dataclasses.asdict(part).items()}
     material = _material(layer)
-    used = {name: float(getattr(material, name)) for name in ("c10", "c01", "bulk")}
+    used: dict[str, Any] = {name: float(getattr(material, name)) for name in ("c10", "c01", "bulk")}
+    if math.isinf(used["bulk"]):
+        used["bulk"] = "inf"  # JSON has no infinite number; --bulk reads this
     used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(load.thickness)[-1]
     assumed = [name for name in used if given[name] is None]
     stated = {name: value for name, value in given.items() if value is not None}
@@ -338,7 +341,11 @@ def _show_assumptions(palpation: Palpation, load: Imprint, layer: LayerOptions, 
         + (" and filled" if missing else ""),
         "smoothing": " and ".join(f"{1e3 * width:g} µm FWHM" for width in _smoothing(thickness)) or "none",
         "material": f"Mooney–Rivlin C10 = {1e3 * material.c10:g} kPa, C01 = {1e3 * material.c01:g} kPa, "
-        f"bulk = {1e3 * material.bulk:g} kPa (K/µ = {material.bulk / material.shear:.3g})",
+        + (
+            "incompressible"
+            if math.isinf(material.bulk)
+            else f"bulk = {1e3 * material.bulk:g} kPa (K/µ = {material.bulk / material.shear:.3g})"
+        ),
         "window": f"hard contact, friction {contact.window_friction:g}",
         "sample": f"exponential contact p0 = {contact.p0:g} MPa, c0 = {1e3 * contact.c0:g} µm, "
         f"friction {contact.sample_friction:g}",

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
 
+from ..model.palpation import Element
+
 # The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
 _ELEMENTS = (40, 40, 4)
@@ -43,7 +45,10 @@ class LayerOptions:
     ] = None
     bulk: Annotated[
         float | None,
-        Parameter(help=f"Bulk modulus in MPa; required with --c10 or --c01. Default: {PUBLISHED_BULK}, K/µ = 20."),
+        Parameter(
+            help="Bulk modulus in MPa, or inf (incompressible: with --element hybrid); required with --c10 or --c01. "
+            f"Default: {PUBLISHED_BULK}, K/µ = 20."
+        ),
     ] = None
     layer_extent: Annotated[
         tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
@@ -51,9 +56,9 @@ class LayerOptions:
     elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
         _ELEMENTS
     )
-    element: Annotated[
-        Literal["mean_dilatation", "full"], Parameter(help="Element; only the default is free of locking.")
-    ] = "mean_dilatation"
+    element: Annotated[Element, Parameter(help="Element: see Palpation; hybrid for a nearly incompressible layer.")] = (
+        "mean_dilatation"
+    )
     sides: Annotated[Literal["free", "roller"], Parameter(help="What the layer's sides meet.")] = "free"
 
 
