@@ -80,7 +80,10 @@ CELLS = {
 class AbstractCells(eqx.Module):
     """What a body is integrated over; the caller multiplies stresses and tangents with `weight`."""
 
-    weight: eqx.AbstractVar[Array]  # reference volume of the points [mm³], (points, *cells)
+    @property
+    def weight(self) -> Float[Array, "points *cells"]:
+        """Reference volume of the points [mm³]."""
+        raise NotImplementedError
 
     def displacement_gradient(self, u: Array) -> Float[Array, "3 3 points *cells"]:
         """Compute H[i, J] = du_i/dX_J at the points."""

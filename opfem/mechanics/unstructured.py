@@ -33,17 +33,22 @@ class UnstructuredCells(AbstractCells):
     """Cells, their integration points, and who shares a node with whom.
 
     Attributes:
-        weight: Reference volume of the integration points [mm³].
+        point_volume: Reference volume of the integration points [mm³].
         dN_dX: Gradients of the shape functions at the integration points [1/mm].
         cells: Nodes of every cell.
         incidence: For every node the places `a * elements + e` of its cells' values; unused places
             hold `a * elements`, one past the last.
     """
 
-    weight: Float[Array, "points elements"]
+    point_volume: Float[Array, "points elements"]
     dN_dX: Float[Array, "a 3 points elements"]
     cells: Int[np.ndarray | Array, "a elements"]
     incidence: Int[np.ndarray | Array, "nodes sharing"]
+
+    @property
+    def weight(self) -> Float[Array, "points elements"]:
+        """Reference volume of the integration points [mm³]."""
+        return self.point_volume
 
     def gather(self, u: Float[Array, "3 nodes"]) -> Float[Array, "a 3 elements"]:
         """Collect the nodal values of every cell."""
@@ -122,7 +127,7 @@ def unstructured_cells(
     volume = jnp.sum(jacobian[0] * cof[0], axis=0)
     _check_volume(concrete(volume))
     return UnstructuredCells(
-        weight=volume * _POINT_VOLUME[kind],
+        point_volume=volume * _POINT_VOLUME[kind],
         dN_dX=jnp.einsum("qma,Jmqe->aJqe", jnp.asarray(gradients, nodal.dtype), cof / volume),
         cells=cells.T.astype(np.int32),
         incidence=_incidence(cells, nodes),

@@ -81,12 +81,8 @@ def _solve(
 
     def unfinished(carry):
         _, r, count = carry
-        return ~(_size(r) <= target) & (count < _MOST_CORRECTIONS)
+        return ~(problem.size(r) <= target) & (count < _MOST_CORRECTIONS)
 
-    target = _RTOL * _size(b)
+    target = _RTOL * problem.size(b)
     x, r, _ = jax.lax.while_loop(unfinished, correct, (jax.tree.map(jnp.zeros_like, b), b, 0))
-    return jax.tree.map(lambda v: jnp.where((_size(r) <= target) & is_known, v, jnp.nan), x)
-
-
-def _size(r: Unknowns) -> Array:
-    return jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(r)))
+    return jax.tree.map(lambda v: jnp.where((problem.size(r) <= target) & is_known, v, jnp.nan), x)

@@ -79,7 +79,7 @@ class Forces(NamedTuple):
     """Nodal forces on the layer [N] at one state, those of each body, and the smallest volume ratio."""
 
     internal: Nodal
-    volume: Array | None  # volume that a mean stress misses, as a force [N], where it is an unknown
+    volume: Array | None  # that the elements miss for their mean stress [mm³], where it is an unknown
     applied: Bodies  # of Touching
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
@@ -113,7 +113,7 @@ class Problem(eqx.Module):
         """Compute internal and applied nodal forces [N]."""
         u, mean_stress = x
         internal, smallest_J = self.body.internal_force(u, mean_stress)
-        volume = None if mean_stress is None else self.stress_scale * self.body.volume_residual(u, mean_stress)
+        volume = None if mean_stress is None else self.body.volume_residual(u, mean_stress)
         internal = internal + self._drag(self.viscosity) * _node_share(u.shape[1:]) * (u - state.u)
         spring = None if self.spring is None else -self.spring * u[:2, 0]
         return self.with_contact(Forces(internal, volume, Bodies(), spring, smallest_J), u, fraction, state)
@@ -216,8 +216,13 @@ class Problem(eqx.Module):
 
     @property
     def stress_scale(self) -> Array:
-        """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]."""
+        """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]; times volume, a force."""
         return self.body.material.shear / self.body.cells.element_depth
+
+    def size(self, r: Unknowns) -> Array:
+        """Compute the Euclidean norm of a residual [N]."""
+        parts = jax.tree.leaves(r.scaled(self.stress_scale))
+        return jnp.sqrt(sum((jnp.vdot(part, part) for part in parts), start=jnp.zeros((), r.u.dtype)))
 
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""

@@ -120,7 +120,7 @@ def solve_increment(
 
     def evaluate(x):
         forces = problem.forces(x, fraction, state)
-        size = _norm(problem.residual(forces, held))
+        size = problem.size(problem.residual(forces, held))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
         return forces, size, settings.rtol * problem.force_scale(forces)
 
@@ -181,11 +181,9 @@ def solve_increment(
 
 
 def solve_tangent(problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton) -> KrylovResult:
-    """Solve one linear system with the tangent, on free unknowns without the held rigid motions.
-
-    In the result, mean stress is in MPa.
-    """
+    """Solve one linear system with the tangent, on free unknowns without the held rigid motions."""
     precondition = preconditioner(tangent, problem.free, problem.typical_stiffness)
+    scale = problem.stress_scale
 
     def inside(x: Unknowns) -> Unknowns:
         return x._replace(u=problem.project(x.u, held))
@@ -193,14 +191,12 @@ def solve_tangent(problem: Problem, tangent: Tangent, b: Unknowns, held: Array, 
     result = fgmres(
         lambda v: inside(tangent.apply(inside(v))),
         lambda v: inside(precondition(v)),
-        b,
+        b.scaled(scale),
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,
         max_iterations=settings.krylov_steps,
     )
-    if result.x.mean_stress is None:
-        return result
-    return result._replace(x=result.x._replace(mean_stress=problem.stress_scale * result.x.mean_stress))
+    return result._replace(x=result.x.scaled(scale))
 
 
 def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:
@@ -208,7 +204,3 @@ def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -
     reach = jnp.sqrt(jnp.sum(change**2, axis=0))
     longest = step_limit * jnp.min(problem.body.cells.element_spacing) + 4.0 * jnp.mean(reach)
     return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))
-
-
-def _norm(r: Unknowns) -> Array:
-    return jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(r)))

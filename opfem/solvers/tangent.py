@@ -21,16 +21,20 @@ class Unknowns(NamedTuple):
 
     Attributes:
         u: Displacement [mm]; as a residual, force [N].
-        mean_stress: Mean stress of the elements [MPa]; in linear systems over `Problem.stress_scale` [mm],
-            as a residual the volume it misses times that scale [N]. None where it is no unknown.
+        mean_stress: Mean stress of the elements [MPa]; as a residual, the volume they miss [mm³]. None where
+            it is no unknown.
     """
 
     u: Nodal
     mean_stress: Float[Array, "nz ny nx"] | None = None
 
+    def scaled(self, scale: Array) -> "Unknowns":
+        """Multiply mean stress by a scale: over a linear system's scale it is in mm, its residual in N."""
+        return self._replace(mean_stress=None if self.mean_stress is None else scale * self.mean_stress)
+
 
 class VolumeCoupling(NamedTuple):
-    """How mean stress and displacement couple, both in mm.
+    """How mean stress and displacement couple, both in mm (`Unknowns.scaled`).
 
     Attributes:
         vectors: Derivative of each element's volume by its free nodes, times the scale [N/mm].
