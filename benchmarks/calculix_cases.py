@@ -240,8 +240,9 @@ def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int
 
 
 def limit(coarse: float, middle: float, fine: float) -> float:
-    """Extrapolate three halvings whose differences fall geometrically (Aitken)."""
-    return fine - (fine - middle) ** 2 / ((fine - middle) - (middle - coarse))
+    """Extrapolate three halvings whose differences fall geometrically (Aitken); NaN where they do not fall."""
+    ratio = (fine - middle) / (middle - coarse)
+    return fine + (fine - middle) * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.nan
 
 
 def main() -> None:
