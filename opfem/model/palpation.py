@@ -33,6 +33,8 @@ class Palpation(eqx.Module):
             bulk modulus, also `jnp.inf`), "full" (2×2×2 points; locks), "reduced" (one point with hourglass
             control; soft in bending). Tetrahedra that divide the same box: "tet4" (six to an element; locks
             worse than "full") and "tet10" (quadratic, six to 2×2×2 elements with their nodes: nx, ny, nz even).
+            Contact pushes tetrahedra at their nodes with the share of their triangles; in "tet10" only middles
+            of edges have one, and a layer squeezed to 60% between rollers does not converge.
         hold: What keeps a layer in place that friction cannot. None: its mean in-plane motion and
             rotation at the window are held, until friction can carry what the hold carries. A number
             [N/mm]: a uniform in-plane spring under the whole layer instead, so that it can drift.

@@ -20,6 +20,33 @@ def squeezed(material, stretch: float, sides="free") -> tuple[float, op.Solution
     return float(solution.stress_zz[0, 0]), solution
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("element", ["reduced", "hybrid", "tet4", "tet10"])
+def test_07_08_uniform_compression_to_half_the_thickness(element):
+    """VALIDATION.md, table A [MPa]; under contact in test_closed_forms."""
+    layer = op.Layer(L0, op.MooneyRivlin(C10, C01, bulk=20 * SHEAR))
+    for sides, expected in (("free", 12.807315e-3), ("roller", 68.587463e-3)):
+        palpation = op.Palpation(layer, (SIDE, SIDE), (4, 4, 2), op.Roller(), op.Roller(), sides=sides, element=element)
+        solution = op.solve(palpation, op.Displacement(-0.5 * L0), op.Newton(rtol=1e-9))
+        np.testing.assert_allclose(solution.stress_zz, -expected, rtol=1e-7)
+        np.testing.assert_allclose(solution.pressure, expected, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_contact_patch_of_quadratic_tetrahedra():
+    """A flat sample without friction finds a uniform pressure, as it does on hexahedra."""
+    window, sample = op.Contact(op.HardOverclosure(), 0.0), op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.0)
+    layer = op.Layer(L0, op.MooneyRivlin(C10, C01, bulk=20 * SHEAR))
+    flat = op.Imprint(op.ThicknessMap(np.full((5, 5), 0.7 * L0), extent=(SIDE, SIDE)))
+    pressures = [
+        op.solve(
+            op.Palpation(layer, (SIDE, SIDE), (4, 4, 2), window, sample, element=element), flat, op.Newton(rtol=1e-10)
+        ).pressure
+        for element in ("mean_dilatation", "tet10")
+    ]
+    np.testing.assert_allclose(pressures[1], pressures[0], rtol=1e-6)
+
+
 def mooney_rivlin(stretch: float) -> float:
     return 2 * (stretch**2 - 1 / stretch) * (C10 + C01 / stretch)
 
