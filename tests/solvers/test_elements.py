@@ -59,6 +59,7 @@ def test_10_incompressible_uniaxial_mooney_rivlin(ratio):
         assert float(solution.stats["min_volume_ratio"]) == pytest.approx(1.0, abs=1e-4 if np.isfinite(ratio) else 1e-7)
 
 
+@pytest.mark.slow
 def test_10_incompressible_equibiaxial_mooney_rivlin():
     """Squeezing by λ⁻² spreads by λ both ways: the equibiaxial state plus a pressure."""
     for stretch in (1.1, 1.3):

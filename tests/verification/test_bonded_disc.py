@@ -13,6 +13,8 @@ from tests.tolerances import SOLVER
 from tests.verification import meshes
 from tests.verification.statics import at, body, held
 
+pytestmark = pytest.mark.slow
+
 MODULUS = 0.02
 LARGE_STRAIN = 0.01
 TABLE_C = {
@@ -57,7 +59,6 @@ def apparent_modulus(nu, S, form="hybrid"):
     return force / (np.pi * radius**2 * strain) / (2.0 * shear * (1.0 + nu)), solution
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("nu", "S", "reference"), CASES)
 def test_15_apparent_modulus_of_a_bonded_disc(nu, S, reference):
     assert apparent_modulus(nu, S)[0] == pytest.approx(reference, rel=MODULUS)
@@ -69,7 +70,6 @@ def test_15_mean_dilatation_is_hybrid():
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("strain", "reference"), [(0.10, 0.1615), (0.15, 0.2524), (0.20, 0.3509)])
 def test_16_bonded_disc_at_large_strain(strain, reference):
     points, solid = disc(2.5, 0.5, op.NeoHooke(0.002903, 20 * 0.005806), "mean_dilatation")

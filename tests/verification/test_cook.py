@@ -12,6 +12,8 @@ from tests.tolerances import SOLVER
 from tests.verification import meshes
 from tests.verification.statics import at, body, held, nearest, nodal_areas
 
+pytestmark = pytest.mark.slow
+
 SHEAR, BULK = 80.1938, 400889.8
 TIP_Y, TIP_X = 6.934, -5.832
 TIP_Y_AT_20 = 7.185
@@ -33,7 +35,6 @@ def tip(n, form, bulk=BULK, kind="hex8", force=100.0, increments=4):
     return solution.displacement[:, nearest(points, 48.0, 60.0, 0.0)], solution
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["mean_dilatation", "hybrid"])
 def test_13_tip_of_cooks_membrane(form):
     u, _ = tip(32, form)
@@ -41,7 +42,6 @@ def test_13_tip_of_cooks_membrane(form):
     assert u[0] == pytest.approx(TIP_X, rel=COOK)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["mean_dilatation", "hybrid"])
 def test_13_tip_at_twenty_shear_moduli(form):
     u, _ = tip(32, form, bulk=20 * SHEAR)

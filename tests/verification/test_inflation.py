@@ -13,6 +13,8 @@ from opfem.solvers.sparse_statics import StaticProblem, StaticSettings, solve_st
 from tests.verification import meshes
 from tests.verification.statics import at, body, held
 
+pytestmark = pytest.mark.slow
+
 SHEAR = 0.005806
 RADII = np.linspace(1.0, 2.0, 9)
 INFLATION = 0.01
@@ -56,7 +58,6 @@ def inflated(shape, pressure=1.0, stretch=None, throw=True, arc=6, **settings):
     return solution, np.linalg.norm(x if sphere else x[:2], axis=0)[inside].mean()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("stretch", "reference"), [(1.25, 0.551869), (1.5, 0.755433), (2.0, 0.806927)])
 def test_11_pressure_of_rivlins_sphere(stretch, reference):
     assert sphere_pressure(stretch) == pytest.approx(reference, abs=1e-6)
@@ -64,7 +65,6 @@ def test_11_pressure_of_rivlins_sphere(stretch, reference):
     assert solution.load_factor == pytest.approx(reference, rel=INFLATION)
 
 
-@pytest.mark.slow
 def test_11_sphere_under_load_control():
     """Below the largest pressure the load is carried at the stretch of the closed form."""
     solution, stretch = inflated("sphere", pressure=0.7)
@@ -73,7 +73,6 @@ def test_11_sphere_under_load_control():
     assert max(len(steps) for steps in solution.residuals) <= 6
 
 
-@pytest.mark.slow
 def test_11_sphere_fails_cleanly_above_its_largest_pressure():
     pressure = 0.85
     solution, stretch = inflated("sphere", pressure, throw=False, arc=4, max_cuts=3)
