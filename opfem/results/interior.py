@@ -48,8 +48,9 @@ class LayerFields(eqx.Module):
     def at_nodes(self, values: Float[Array, "*components points cz cy cx"]) -> Float[Array, "*components mz my mx"]:
         """Recover a field at the nodes: extrapolated in each cell, then averaged by reference volume.
 
-        It is exact for a field that is linear in the reference position ("reduced": constant), and reaches
-        the surfaces, where an element mean lies half an element below.
+        It is exact for a field that is linear in the reference position, and reaches the surfaces, where an
+        element mean lies half an element below. Not so "reduced" and "tet4", whose points do not fix all
+        slopes in a cell: exact for a constant, at the surfaces near the mean.
 
         Args:
             values: One of the fields, or any like it.
@@ -69,7 +70,7 @@ def _extrapolation(kind: CellKind, points: int) -> np.ndarray:
     """
 
     def terms(at: np.ndarray) -> np.ndarray:
-        x, y, z = at.T
+        x, y, z = at.T - 0.5  # from the middle, so that a constant stays one where the points do not fix every slope
         one = np.ones_like(x)
         if points == 1:
             return one[:, None]

@@ -29,7 +29,7 @@ def with_palpation(solution, thickness=0.5, element="mean_dilatation"):
     return eqx.tree_at(lambda s: s.palpation, solution, palpation)
 
 
-@pytest.mark.parametrize("element", ["mean_dilatation", "full"])
+@pytest.mark.parametrize("element", ["mean_dilatation", "full", "reduced", "tet4", "tet10"])
 def test_uniform_deformation(solution, element):
     H = np.array([[0.1, 0.2, -0.05], [0.0, -0.2, 0.1], [0.15, 0.0, -0.3]])
     F = np.eye(3) + H
@@ -62,6 +62,21 @@ def test_a_linear_field_is_recovered_exactly_up_to_the_surfaces(solution):
     ).reshape(3, 2, 2, 2, nz, ny, nx)
     at_points = np.einsum("ca,db,eg,iabgkjl->icdekjl", linear[0], linear[1], linear[2], cells)
     np.testing.assert_allclose(fields.at_nodes(jnp.asarray(at_points.reshape(3, 8, nz, ny, nx))), X, ROUNDOFF, ROUNDOFF)
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_linear_field_is_recovered_exactly_from_tetrahedra(solution, element):
+    """Position itself, at the points of a flat layer; the centroids of an element's six tetrahedra lie in a plane."""
+    flat = with_palpation(solution, element=element)
+    X = flat.palpation.mesh().positions()
+    fields = op.layer_fields(flat)
+    kind = fields.cells.kind
+    first = np.stack([np.asarray(x)[(slice(None, -1, kind.span),) * 3] for x in X])
+    size = np.array([2.0 / 6, 2.0 / 6, 0.5 / 2]) * kind.span
+    at_points = first[:, None] + (size * kind.points).T[:, :, None, None, None]
+    known = (slice(None), *[slice(1, -1) if element == "tet4" else slice(None)] * 3)
+    np.testing.assert_allclose(fields.at_nodes(jnp.asarray(at_points))[known], X[known], ROUNDOFF, ROUNDOFF)
+    assert fields.element_mean(fields.stress).shape == (3, 3, 2, 6, 6)
 
 
 def test_sums_are_the_solves_own(solution, fields):
