@@ -57,7 +57,7 @@ def test_whole_numbers_of_another_type_are_counts(elements, annotations_unchecke
             r"Palpation\.window must be Bonded\(\), Roller\(\) or Contact\(law, friction\), got 'bonded'\.",
         ),
         ({"sample": op.HardOverclosure()}, r"Palpation\.sample must be Bonded\(\), Roller\(\) or Contact"),
-        ({"element": "reduced"}, r"Palpation\.element must be one of .*'full'.*, got 'reduced'\."),
+        ({"element": "quadratic"}, r"Palpation\.element must be one of .*'full'.*, got 'quadratic'\."),
         ({"sides": "fixed"}, r'Palpation\.sides must be "free", "roller" or a dict .*, got \'fixed\'\.'),
         ({"sides": {"z0": "roller"}}, r"a dict of these by \('x0', 'x1', 'y0', 'y1'\), got \{'z0': 'roller'\}\."),
         ({"sides": {"x0": "fixed"}}, r"Palpation\.sides must be .* got \{'x0': 'fixed'\}\."),
