@@ -323,8 +323,14 @@ def test_jit_equals_eager_and_vmap_a_loop(samples):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: op.MooneyRivlin(2e-3, 1e-3, 0.0), r"MooneyRivlin\.bulk \[MPa\] must be positive, or jnp\.inf .*, got 0\.0\."),
-        (lambda: op.MooneyRivlin(2e-3, 1e-3, np.nan), r"MooneyRivlin\.bulk \[MPa\] must be positive, or jnp\.inf .*, got nan\."),
+        (
+            lambda: op.MooneyRivlin(2e-3, 1e-3, 0.0),
+            r"MooneyRivlin\.bulk \[MPa\] must be positive, or jnp\.inf .*, got 0\.0\.",
+        ),
+        (
+            lambda: op.MooneyRivlin(2e-3, 1e-3, np.nan),
+            r"MooneyRivlin\.bulk \[MPa\] must be positive, or jnp\.inf .*, got nan\.",
+        ),
         (lambda: op.MooneyRivlin(np.nan, 1e-3, 0.1), r"MooneyRivlin\.c10 \[MPa\] must be finite, got nan\."),
         (lambda: op.MooneyRivlin(2e-3, np.nan, 0.1), r"MooneyRivlin\.c01 \[MPa\] must be finite, got nan\."),
         (lambda: op.MooneyRivlin(1e-3, -2e-3, 0.1), r"2 \(c10 \+ c01\) \[MPa\] must be positive, got -0\.002\."),
