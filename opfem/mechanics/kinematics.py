@@ -140,7 +140,8 @@ class LayerCells(AbstractCells):
     @property
     def weight(self) -> Float[Array, "points _ ny nx"]:
         """Reference volume of the points [mm³]."""
-        return self.depth * (self.spacing[0] * self.spacing[1] * self.kind.weights[:, None, None, None])
+        share = jnp.asarray(self.kind.weights, self.depth.dtype)[:, None, None, None]
+        return self.depth * (self.spacing[0] * self.spacing[1] * share)
 
     @property
     def element_spacing(self) -> Float[Array, "2"]:

@@ -145,6 +145,19 @@ def test_cells_fill_the_layer(element):
     assert total == pytest.approx(volume, rel=ROUNDOFF if element not in ("tet4", "tet10") else 0.05)
 
 
+@EVERY
+def test_single_precision_stays_single(element, crumpled):
+    """The tangent is assembled in float32; one constant in float64 would double its cost."""
+    _, body = warped(element)
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), body)
+    u = crumpled.astype(jnp.float32)
+    p = None if body.form != "hybrid" else jnp.zeros(ELEMENTS[::-1], jnp.float32)
+    results = [_force(single, u, p), _stiffness(single, u, p)]
+    results += [single.volume_vectors(u)] if body.form == "hybrid" else []
+    results += [single.point_tangent(u)] if element == "tet10" else []
+    assert {result.dtype for result in results} == {jnp.dtype("float32")}
+
+
 def cells_of(body):
     return body.cells.slope_x.shape[1:]
 
