@@ -2,8 +2,8 @@
 
 Run `python -m benchmarks.calculix_cases SHARED [--only PATTERN] [--element full mean_dilatation]` in the
 repository's root. SHARED is the folder that holds reference/ccx/cases. Prints one JSON line per figure and then
-the table. With `--refine [--elements 8 16 32]` it instead solves the problems of prescribed displacement on
-finer and finer meshes, which shows where both element forms, and CalculiX's other elements, go.
+the table. With `--refine [--elements 8 16 32]` it instead solves the problems of prescribed displacement, and of
+the coin's contact, on finer and finer meshes: where both element forms, and CalculiX's other elements, go.
 """
 
 import argparse
@@ -11,6 +11,7 @@ import fnmatch
 import json
 import re
 import time
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -215,8 +216,19 @@ def coin_uz(shared: Path, n: int) -> np.ndarray:
     return cases.nodal_map(cases.load_case(shared, name)[0], 2, n)
 
 
+def case_names(shared: Path, pattern: str) -> list[str]:
+    """List the stored cases of a pattern."""
+    return fnmatch.filter((path.stem for path in (shared / "reference" / "ccx" / "cases").glob("*.json")), pattern)
+
+
+def contact_on_mesh(shared: Path, name: str, n: int, element: str) -> tuple[op.Palpation, op.Imprint]:
+    """State a stored contact case of the coin on n × n × n/10 elements."""
+    palpation, load = statement(shared, name, element)
+    return replace(palpation, elements=(n, n, n // 10), sides="free"), load
+
+
 def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int] | None) -> None:
-    """Solve the problems of prescribed displacement on finer and finer meshes; print every figure and its limit."""
+    """Solve problems on finer and finer meshes; print every figure and its limit."""
     coin = {"coin_slip": (False, 0.11732), "coin_slip_k200": (False, 1.1732), "coin_bonded": (True, 0.11732)}
     problems = {f"fam_{v}": ((8, 16, 24, 32, 48), partial(cases.formula_family, v)) for v in ("B1", "B2", "B3")}
     for name, about in coin.items():
@@ -224,14 +236,16 @@ def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int
             (20, 40, 80),
             lambda n, element, about=about: prescribed_coin(coin_uz(shared, n), *about, element),
         )
+    for name in case_names(shared, "coin_ccxcontact*") + case_names(shared, "smoothcoin*"):
+        problems[name] = ((20, 40, 60), partial(contact_on_mesh, shared, name))
     for name in fnmatch.filter(problems, pattern):
         usual, state = problems[name]
         for element in elements:
             found = {}
             for n in meshes or usual:
-                solution = op.solve(*state(n, element), progress=False)
+                solution = op.solve(*state(n, element), throw=False, progress=False)
                 values = described(solution, name)
-                found[n] = {quantity: values[quantity] for quantity in UNITS if np.ndim(values.get(quantity, [])) == 0}
+                found[n] = {q: float(values[q]) for q in UNITS if np.ndim(values.get(q, [])) == 0}
                 print(json.dumps({"problem": name, "element": element, "n": n} | found[n]), flush=True)
                 jax.clear_caches()
             for three in [(n, 2 * n, 4 * n) for n in found if {2 * n, 4 * n} <= set(found)]:
@@ -251,7 +265,9 @@ def main() -> None:
     parser.add_argument("--only", default="*", metavar="PATTERN", help="names of cases, such as 'fam_B3*'")
     parser.add_argument("--element", nargs="+", choices=ELEMENTS, default=list(ELEMENTS))
     parser.add_argument(
-        "--refine", action="store_true", help="refine instead: fam_B1, …, coin_slip, coin_slip_k200, coin_bonded"
+        "--refine",
+        action="store_true",
+        help="refine instead: fam_B1 …, coin_slip, coin_bonded …, coin_ccxcontact…",
     )
     parser.add_argument("--elements", type=int, nargs="+", help="meshes of the refinement, elements per side")
     chosen = parser.parse_args()
@@ -259,8 +275,7 @@ def main() -> None:
     if chosen.refine:
         refinement(chosen.shared, chosen.only, chosen.element, chosen.elements)
         return
-    names = [path.stem for path in (chosen.shared / "reference" / "ccx" / "cases").glob("*.json")]
-    names = fnmatch.filter(names, chosen.only)
+    names = case_names(chosen.shared, chosen.only)
     if not names:
         parser.error(f"no stored case is called {chosen.only!r}")
     print_table(case_rows(chosen.shared, names, chosen.element), chosen.element)

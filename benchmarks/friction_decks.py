@@ -85,7 +85,7 @@ def overclosure(behavior: Keyword) -> op.HardOverclosure | op.ExponentialOverclo
     """Build the pressure–overclosure law."""
     kind = behavior.options.get("pressure-overclosure", "").upper()
     if kind == "HARD":
-        return op.HardOverclosure()
+        return op.HardOverclosure(exact=True)
     if kind == "EXPONENTIAL":
         clearance, pressure = behavior.numbers()
         return op.ExponentialOverclosure(pressure, clearance)

@@ -255,6 +255,24 @@ class TestFailures:
         assert "Interrupted" in capsys.readouterr().err
         assert os.listdir(out) == ["result.nc"]
 
+    def test_an_interrupt_that_python_drops_is_raised_again(self, tmp_path, map_file, monkeypatch, capsys):
+        class Callback:
+            def __del__(self):
+                raise KeyboardInterrupt
+
+        def solve(*_):
+            Callback()
+            time.sleep(30)
+
+        monkeypatch.setattr(cli, "solve", solve)
+        # A test run in the background ignores Ctrl-C.
+        former = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            assert opfem("palpate", map_file, *SMALL, "--out", tmp_path / "o") == 130
+        finally:
+            signal.signal(signal.SIGINT, former)
+        assert "Interrupted" in capsys.readouterr().err
+
     def test_interrupted_writing_leaves_only_whole_files(self, tmp_path, map_file, solved, monkeypatch):
         def half(self, target, **_):
             target.write_bytes(b"half")
@@ -272,7 +290,9 @@ class TestFailures:
 def test_ctrl_c_in_a_fresh_process(tmp_path, seconds):
     """The interpreter ends in order although a computation is in flight."""
     out = tmp_path / "o"
-    code = "from opfem.cli import main; main()"
+    # A test run in the background hands on that Ctrl-C is ignored; a terminal does not.
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{listen}; from opfem.cli import main; main()"
     process = subprocess.Popen(
         [sys.executable, "-c", code, "palpate", "example", "--out", out, "--elements", "20", "20", "4"],
         stdout=subprocess.PIPE,

@@ -15,6 +15,8 @@ PRINTED = {
         r"uniform compression: largest difference \d\.\de-(0[7-9]|1\d)",
         r"without friction: difference \d\.\de-(0[7-9]|1\d)",
         r"transfer function: largest difference 0\.\d\d%",
+        r"hybrid, 4 layers: [+-]\d\.\d%",
+        r"hard contact: penetration \de-0[5-9] µm",
     ],
 }
 SLOW = {"verification": pytest.mark.slow}

@@ -3,12 +3,14 @@
 It reads, solves and writes with the same public functions as a notebook, and says what it assumed.
 """
 
+import _thread
 import dataclasses
 import json
 import math
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -230,7 +232,8 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
 def _reporting(debug: bool) -> Iterator[None]:
     """End with a message and an exit status instead of a traceback."""
     try:
-        yield
+        with _redelivered_interrupts():
+            yield
     except KeyboardInterrupt:
         _complain("Interrupted; no file was left half-written.")
         raise SystemExit(INTERRUPTED) from None
@@ -241,6 +244,28 @@ def _reporting(debug: bool) -> Iterator[None]:
         unexpected = f"Unexpected {type(cause).__name__}: {cause} (--debug shows where; please report it.)"
         _complain(str(cause) if expected else unexpected)
         raise SystemExit(1) from None
+
+
+@contextmanager
+def _redelivered_interrupts() -> Iterator[None]:
+    """Raise Ctrl-C again where Python drops it.
+
+    An exception in a callback of the garbage collector is printed and forgotten, and jax has such a callback, which
+    runs often while it traces.
+    """
+    report = sys.unraisablehook
+
+    def redeliver(dropped: Any) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(0.01, _thread.interrupt_main).start()
+        else:
+            report(dropped)
+
+    sys.unraisablehook = redeliver
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
 
 
 def _complain(message: str) -> None:

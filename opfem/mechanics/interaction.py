@@ -5,6 +5,7 @@ Friction is Coulomb's with elastic slip and a return map; the slip of a point is
 the surface, in the surface's own (x, y), and its history is carried from increment to increment.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +17,9 @@ from jaxtyping import Array, Bool, Float
 from ..model import Contact, HeightField
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
+
+# Share of the largest elastic slip from which a point counts as slipping.
+_AT_LIMIT = 0.9
 
 Corners = Float[Array, "4 3 *faces"]  # nodal values at the corners of every face
 PointVector = Float[Array, "3 points *faces"]
@@ -89,6 +93,7 @@ class PointContact(NamedTuple):
     slid: Float[Array, "2 points *faces"]
     friction: Float[Array, "2 points *faces"]  # conjugate to slip in the surface's (x, y)
     sliding: Array
+    slips: Array  # friction at its limit, or just below after an increment that only settles
     guard: Float[Array, "3 3 points *faces"]  # symmetric positive part of -d(traction)/dx
 
 
@@ -173,7 +178,7 @@ class ContactFace(eqx.Module):
         stretch = jnp.sqrt(1.0 + slope_x**2 + slope_y**2)
         normal = jnp.stack([-slope_x, -slope_y, jnp.ones_like(slope_x)]) / stretch
         clearance = (side * (height - position[2]) + self.offset) / stretch
-        pressure, stiffness = self._pressure(fraction, clearance, law or self._law)
+        pressure, stiffness = self._pressure(fraction, clearance, law or self._law(history))
         friction = self._friction(pressure, position, history, slope_x, slope_y, None if law is None else law.sticks)
         push = 0.0 if self.imposed is not None else side * pressure
         traction = friction.traction - push * normal
@@ -182,11 +187,36 @@ class ContactFace(eqx.Module):
         slid_along = friction.direction[:, None] * friction.direction[None]
         guard = stiffness * along + friction.stiffness * (eye - along - slid_along)
         return PointContact(
-            traction, pressure, clearance, friction.elastic, friction.slid, friction.conjugate, friction.sliding, guard
+            traction,
+            pressure,
+            clearance,
+            friction.elastic,
+            friction.slid,
+            friction.conjugate,
+            friction.sliding,
+            friction.slips,
+            guard,
         )
 
-    def _law(self, clearance: Array) -> Array:
-        return self.contact.law.pressure(clearance, self.stiffness)
+    @property
+    def is_exact(self) -> bool:
+        """Whether the pressure is to be reached without penetration."""
+        return self.contact.law.exact and self.imposed is None
+
+    def _carried(self, history: SlipHistory) -> Array | float:
+        """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""
+        return self.contact.law.clearance(history.pressure, self.stiffness) if self.is_exact else 0.0
+
+    def _law(self, history: SlipHistory) -> Callable[[Array], Array]:
+        carried = self._carried(history)
+        return lambda clearance: self.contact.law.pressure(clearance + carried, self.stiffness)
+
+    def missed_gap(self, before: SlipHistory, after: SlipHistory) -> Array:
+        """Compute the largest gap or penetration [mm] that an increment left to exact contact; 0 for other laws."""
+        if not self.is_exact:
+            return jnp.zeros_like(after.dissipated)
+        gap = self.contact.law.clearance(after.pressure - before.pressure, self.stiffness)
+        return jnp.max(jnp.where(after.pressure > 0, jnp.abs(gap), 0.0))
 
     def _pressure(self, fraction: Array, clearance: Array, law) -> tuple[Array, Array]:
         if self.imposed is not None:
@@ -211,9 +241,10 @@ class ContactFace(eqx.Module):
         sticks = jnp.sum(trial * iterate.direction, axis=0) < 0
         clearance = self.at_points(fraction, position, history).clearance
         most = 1e-3 * self.stiffness * self.element_size
-        pressure = jnp.maximum(iterate.pressure, jnp.minimum(self._law(clearance), most))
-        at = self.contact.law.clearance(pressure, self.stiffness)
-        slope = jax.jvp(self._law, (at,), (jnp.ones_like(at),))[1]
+        law = self._law(history)
+        pressure = jnp.maximum(iterate.pressure, jnp.minimum(law(clearance), most))
+        at = self.contact.law.clearance(pressure, self.stiffness) - self._carried(history)
+        slope = jax.jvp(law, (at,), (jnp.ones_like(at),))[1]
         # Whether a point opens is decided with the layer's own stiffness: the stiff law's would
         # open half of a face at the first micrometre of error.
         closed = (pressure - self.stiffness * (clearance - at) >= 0) & (slope < 0)
@@ -259,6 +290,7 @@ class ContactFace(eqx.Module):
             slid=jnp.where(closed, trial - elastic, 0.0),
             conjugate=conjugate,
             sliding=closed & sliding,
+            slips=closed & (length > _AT_LIMIT * limit),
         )
 
     def _area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
@@ -333,6 +365,7 @@ class _Friction(NamedTuple):
     slid: Array
     conjugate: Array
     sliding: Array
+    slips: Array
 
 
 def _scaled_slope(value: Array, share: Array | float) -> Array:

@@ -4,6 +4,8 @@ Clearance g > 0 is open; pressure is positive in compression and acts on the cur
 Every law is finite, with a finite slope, for any clearance.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,13 @@ _INVERSE_STEPS = 8
 
 
 class AbstractOverclosure(eqx.Module):
-    """A law p(g) with its slope; `scale` is the layer's own stiffness per area [MPa/mm]."""
+    """A law p(g) with its slope; `scale` is the layer's own stiffness per area [MPa/mm].
+
+    Attributes:
+        exact: Whether the law only enforces contact without penetration, and its own penetration is to vanish.
+    """
+
+    exact: ClassVar[bool] = False
 
     def pressure(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
@@ -47,17 +55,29 @@ class HardOverclosure(AbstractOverclosure):
     so that penetration is about 1/stiffness_ratio of the element's own shortening under the
     same pressure: about 0.05 µm at 10 kPa. `stats["max_penetration"]` reports it.
 
+    `exact=True` leaves none, usually below 1e-4 µm, for a tenth more work: the method of multipliers. Each
+    increment carries the pressure of the last one without penetration, and at full load increments follow
+    until nothing is left to carry. The penalty then moves no solution beyond the path that friction takes.
+    The sample, which may be curved, is met at the nodes of the layer: more conditions than nodes could not
+    all be met.
+
     Args:
-        stiffness_ratio: Penalty stiffness over element stiffness [-].
+        stiffness_ratio: Penalty stiffness over element stiffness [-]; None is 1000, and 100 where exact.
+        exact: Whether penetration is to vanish.
 
     Raises:
         ValueError: If stiffness_ratio is not positive.
     """
 
-    stiffness_ratio: Array = eqx.field(converter=as_leaf, default=1000.0)
+    stiffness_ratio: Array
+    exact: bool = eqx.field(static=True)
 
-    def __check_init__(self):
-        check_positive("HardOverclosure.stiffness_ratio", "-", self.stiffness_ratio)
+    def __init__(self, stiffness_ratio=None, exact: bool = False):
+        if stiffness_ratio is None:
+            stiffness_ratio = 100.0 if exact else 1000.0
+        check_positive("HardOverclosure.stiffness_ratio", "-", stiffness_ratio)
+        self.stiffness_ratio = as_leaf(stiffness_ratio)
+        self.exact = exact
 
     def pressure(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""

@@ -47,7 +47,8 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
         x = jax.lax.custom_root(
             lambda x: slowed.balance(x, solve.fraction, state, solve.held), solve.x, lambda _, x: x, tangent_solve
         )
-        return state, slowed.advance(x, solve.fraction, state, solve.held)
+        forces = slowed.forces(x, solve.fraction, state)
+        return state, slowed.advance(x, solve.fraction, state, solve.held, forces)
 
     def step(states, slot):
         index, solve = slot

@@ -56,6 +56,8 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         contact, surface: RigidSurface, above: bool, offset: ArrayLike = 0.0, imposed=None, rule: FaceRule = rule
     ) -> ContactFace:
         offset = jnp.asarray(offset, X.dtype)
+        if contact.law.exact and surface.end is not None:
+            rule = "nodes"
         return ContactFace(contact, surface, offset, imposed, mesh.element_size, stiffness, above, rule, shares=shares)
 
     def with_sides(face: ContactFace | None) -> ContactFace | None:

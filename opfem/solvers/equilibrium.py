@@ -61,6 +61,8 @@ class State(eqx.Module):
         fraction: Load fraction [-].
         histories: Friction history (`SlipHistory`) of the contact with each body.
         held: Whether the in-plane hold carries rigid motion.
+        applied: Forces of each body on the layer (`Touching`) [N].
+        work: Work of each body on the layer so far [N mm].
     """
 
     u: Nodal
@@ -68,6 +70,8 @@ class State(eqx.Module):
     fraction: Float[Array, ""]
     histories: Bodies
     held: Array
+    applied: Bodies
+    work: Bodies
 
     @property
     def unknowns(self) -> Unknowns:
@@ -159,6 +163,13 @@ class Problem(eqx.Module):
             state.histories,
             laws,
         )
+
+    def missed_gap(self, before: State, after: State) -> Array:
+        """Compute the largest gap or penetration [mm] that an increment left to hard contact."""
+        gaps = self.contacts.map(
+            lambda _, face, *histories: face.missed_gap(*histories), before.histories, after.histories
+        )
+        return jnp.max(jnp.stack([jnp.zeros_like(after.fraction), *jax.tree.leaves(gaps)]))
 
     def initial_iterates(self, state: State) -> Bodies:
         """Start the iteration from the contact of a converged state."""
@@ -343,13 +354,30 @@ class Problem(eqx.Module):
         each = stiffness / (4.0 * nx * ny) * lumped[..., None]
         return jnp.broadcast_to(each, (4, 4, 3, 3, ny * nx))
 
-    def advance(self, x: Unknowns, fraction: Array, state: State, held: Array) -> State:
-        """Build the state at the end of an increment, friction history included."""
+    def advance(self, x: Unknowns, fraction: Array, state: State, held: Array, forces: Forces) -> State:
+        """Build the state at the end of an increment, friction history included.
+
+        The work of an increment is taken as if forces changed linearly along it.
+        """
         u = x.u
+        applied = self.reactions(forces).applied
+
+        def work(body, before, after, so_far):
+            mean = 0.5 * (put(before, body, u.shape) + put(after, body, u.shape))
+            return so_far + jnp.vdot(mean, u - state.u)
+
         histories = self.contacts.map(
             lambda body, face, history: face.advance(fraction, self._corners(u, body), history), state.histories
         )
-        return State(u, x.mean_stress, jnp.asarray(fraction, u.dtype), histories, held)
+        return State(
+            u=u,
+            mean_stress=x.mean_stress,
+            fraction=jnp.asarray(fraction, u.dtype),
+            histories=histories,
+            held=held,
+            applied=applied,
+            work=state.applied.map(work, applied, state.work),
+        )
 
     def with_imposed(self, u: Nodal, fraction: Array) -> Nodal:
         """Set the prescribed displacements."""
@@ -365,7 +393,10 @@ class Problem(eqx.Module):
         histories = self.contacts.map(lambda body, face: face.initial_history(self._take(self.positions, body)))
         u = jnp.zeros_like(self.positions)
         mean_stress = jnp.zeros(self.elements, u.dtype) if self.body.form == "hybrid" else None
-        return State(u, mean_stress, jnp.zeros((), u.dtype), histories, jnp.asarray(True))
+        zero = jnp.zeros((), u.dtype)
+        nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._take(u, body), self.elements))
+        applied = Bodies(*(touching or Touching(u[:, 0], None) for touching in nothing))
+        return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
 
 
 # Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.

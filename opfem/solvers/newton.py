@@ -52,7 +52,8 @@ class Newton(eqx.Module):
             times the mean move: a corner that slips over a ridge must not take its neighbours along.
         max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
             solve keeps as many displacement fields. Beyond, derivatives are NaN.
-        face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes".
+        face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
+            sample of exact hard contact, always at the nodes.
 
     Raises:
         ValueError: If a number is not positive.
@@ -171,7 +172,7 @@ def solve_increment(
     first = _Iterate(x, problem.initial_iterates(state), *evaluate(x), zero, zero, zero, zero)
     end = jax.lax.while_loop(unfinished, step, first)
     return IncrementResult(
-        state=problem.advance(end.x, fraction, state, held),
+        state=problem.advance(end.x, fraction, state, held, end.forces),
         converged=end.size <= end.tolerance,
         steps=end.steps,
         krylov=end.krylov,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
-from ..mechanics.boundary import Body, take, to_touching
+from ..mechanics.boundary import Body, Touching, put, take, to_touching
 from ..mechanics.face import (
     area_vector,
     filled_vertices,
@@ -45,10 +45,18 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample.face)
     window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window.face)
     dissipated = [history.dissipated for history in state.histories if history is not None]
+    x = problem.positions + u
+    hold = jnp.concatenate([hold, jnp.zeros_like(hold[:1])])
+    on_layer = {
+        "sample": put(applied.sample, "sample", x.shape),
+        "window": put(applied.window, "window", x.shape),
+        "hold": put(Touching(hold, None), "window", x.shape),
+    }
     stats = {
-        "force_sample": applied.sample.total,
-        "force_window": applied.window.total,
-        "force_hold": jnp.concatenate([jnp.sum(hold, axis=(1, 2)), jnp.zeros(1, u.dtype)]),
+        **{f"force_{name}": jnp.sum(force, axis=(1, 2, 3)) for name, force in on_layer.items()},
+        **{f"moment_{name}": jnp.sum(jnp.cross(x, force, axis=0), axis=(1, 2, 3)) for name, force in on_layer.items()},
+        "work_sample": state.work.sample,
+        "work_window": state.work.window,
         "strain_energy": problem.body.energy(u, state.mean_stress),
         "friction_dissipation": sum(dissipated, start=jnp.zeros((), u.dtype)),
         "approach": sample_stats["approach"],
@@ -92,7 +100,7 @@ def _face(
     weight = size(area_vector(xi, eta))
     weight = weight if face.shares is None else weight * face.shares[:, : weight.shape[1]]
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
-    share = on_nodes(jnp.stack([weight, load, load * point.sliding], axis=1))
+    share = on_nodes(jnp.stack([weight, load, load * point.slips], axis=1))
     status = jnp.where(share[1] > 0, jnp.where(share[2] > 0.5 * share[1], SLIP, STICK), OPEN)
     slip = on_nodes(jnp.moveaxis(new.slip * weight, 1, 0)) / share[0]
     total = jnp.sum(load)

@@ -38,7 +38,7 @@ class FaceResult(eqx.Module):
         pressure: Contact pressure -n·σn on the current area [MPa], positive in compression.
         traction: Force on the layer per reference area, x y z [MPa].
         slip: Tangential slip along x and y against the body [mm].
-        status: 0 open, 1 stick, 2 slip.
+        status: 0 open, 1 stick, 2 slip: the elastic slip is at its limit, or within a tenth of it.
     """
 
     pressure: Float[Array, "my mx"]

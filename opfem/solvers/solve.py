@@ -41,7 +41,9 @@ def solve(
         The solution. `stats` holds `newton_steps`, `krylov_steps`, `increments`, `attempts`,
         `residual` (unbalanced force over contact force), `load_fraction`, `strain_energy` and
         `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
-        the layer, `approach` and `max_penetration` [mm], `min_volume_ratio` [-].
+        the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N mm] about the origin,
+        `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
+        `max_penetration` [mm], `min_volume_ratio` [-].
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.

@@ -38,6 +38,10 @@ _VISCOUS_RTOL = 1e-6
 _VISCOUS_STEPS = 12
 # Solves of one snap before it is given up.
 _SNAP_SOLVES = 80
+# Gap of hard contact that counts as none, over the size of an element; and the share of it that an
+# increment at full load must take away to be followed by another.
+_NO_GAP = 1e-7
+_LEAST_SETTLING = 0.5
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4
 
@@ -70,6 +74,8 @@ class Stepping(NamedTuple):
         can_release: Whether friction could carry what the hold carries.
         release_failed: Whether a try without the hold failed.
         slides: Whether the hold carries a lateral force at the last converged state.
+        missed_gap: Gap or penetration of hard contact at the last converged state that more increments can
+            take away [mm].
         failed: Whether the solve has given up.
         fractions: Load fraction of every accepted increment, NaN beyond.
         path: The solves that led to `origin`, for derivatives; None where none are asked for.
@@ -92,6 +98,7 @@ class Stepping(NamedTuple):
     can_release: Array
     release_failed: Array
     slides: Array
+    missed_gap: Float[Array, ""]
     failed: Array
     fractions: Float[Array, " attempts"]
     path: Path | None
@@ -121,6 +128,7 @@ def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
         can_release=no,
         release_failed=no,
         slides=no,
+        missed_gap=zero,
         failed=no,
         fractions=jnp.full(settings.max_increments, jnp.nan, dtype),
         path=path if with_path else None,
@@ -132,7 +140,7 @@ def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
 def unfinished(s: Stepping) -> Array:
     """Tell whether another increment is to be tried."""
     releasable = s.state.held & s.can_release & ~s.release_failed
-    return ~s.failed & ((s.state.fraction < 1.0) | releasable)
+    return ~s.failed & ((s.state.fraction < 1.0) | releasable | (s.missed_gap > 0))
 
 
 def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
@@ -177,6 +185,9 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     moves_on = accepted | (goes_on & ok)
     length = jnp.where(moves_on, s.length + 1, jnp.where(goes_on, s.length, s.kept))
     can_release, slides = _hold_balance(problem, result.forces, result.state)
+    missed_gap = problem.missed_gap(s.origin, result.state)
+    settles = (left > 0) | (missed_gap < _LEAST_SETTLING * s.missed_gap)
+    missed_gap = jnp.where(settles & (missed_gap > _NO_GAP * problem.body.cells.element_depth), missed_gap, 0.0)
     attempts = s.attempts + 1
     solved = Path(result.state.unknowns, fraction, held, s.viscosity)
     return Stepping(
@@ -195,6 +206,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         can_release=jnp.where(accepted, can_release, s.can_release),
         release_failed=s.release_failed | lost_hold,
         slides=jnp.where(accepted, slides, s.slides),
+        missed_gap=jnp.where(accepted, missed_gap, s.missed_gap),
         failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
         fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
         path=None if s.path is None else _recorded(s, moves_on, solved),

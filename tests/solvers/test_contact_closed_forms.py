@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import opfem as op
+from opfem.model import AbstractOverclosure
 from opfem.solvers.solution import OPEN
 
 pytestmark = pytest.mark.slow
@@ -64,7 +65,7 @@ def hills() -> op.ThicknessMap:
     return op.ThicknessMap(L0 + 0.05 * np.cos(np.pi * x[:, None]) * np.cos(np.pi * x), extent=(2.0, 2.0))
 
 
-def press_flat(stiffness: float) -> op.Solution:
+def press_flat(law: AbstractOverclosure, friction: float = 0.0) -> op.Solution:
     """Press a flat surface into the hills of a bonded layer, contact at the nodes."""
     flat = op.ThicknessMap(np.full((13, 13), L0), extent=(2.0, 2.0))
     palpation = op.Palpation(
@@ -72,16 +73,21 @@ def press_flat(stiffness: float) -> op.Solution:
         extent=(2.0, 2.0),
         elements=(12, 12, 2),
         window=op.Bonded(),
-        sample=op.Contact(op.LinearOverclosure(stiffness), friction=0.0),
+        sample=op.Contact(law, friction),
     )
     return op.solve(palpation, op.Imprint(flat), op.Newton(face_rule="nodes"))
+
+
+def gaps(solution: op.Solution) -> np.ndarray:
+    """Compute the clearance [mm] of every node of the interface from the flat surface."""
+    return L0 - np.asarray(solution.positions[2, -1] + solution.displacement[2, -1])
 
 
 def test_25_contact_pushes_where_it_touches_and_nowhere_else():
     """The recovered pressure differs from the law's by how a node's share of the area is taken, 0.4%."""
     stiffness = 100.0  # MPa/mm
-    solution = press_flat(stiffness)
-    gap = L0 - np.asarray(solution.positions[2, -1] + solution.displacement[2, -1])
+    solution = press_flat(op.LinearOverclosure(stiffness))
+    gap = gaps(solution)
     pressure = np.asarray(solution.pressure)
     assert (pressure >= 0.0).all()
     assert (pressure[gap > 0.0] == 0.0).all()
@@ -92,5 +98,27 @@ def test_25_contact_pushes_where_it_touches_and_nowhere_else():
 def test_25_penetration_falls_as_one_over_the_penalty():
     """Measured: -0.996 and -0.999."""
     stiffness = np.array([10.0, 30.0, 100.0])  # MPa/mm; the layer's own is 0.25
-    depth = [float(press_flat(k).stats["max_penetration"]) for k in stiffness]
+    depth = [float(press_flat(op.LinearOverclosure(k)).stats["max_penetration"]) for k in stiffness]
     np.testing.assert_allclose(np.diff(np.log(depth)) / np.diff(np.log(stiffness)), -1.0, atol=0.05)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_25_hard_contact_leaves_neither_penetration_nor_a_gap_under_pressure(friction):
+    """Measured: 1e-5 µm; the force changes with the stiffness by 2e-7 without friction, by 2e-6 with it."""
+    force = []
+    for ratio in (30.0, 100.0):
+        solution = press_flat(op.HardOverclosure(ratio, exact=True), friction)
+        gap, pressure = gaps(solution), np.asarray(solution.pressure)
+        assert (pressure >= 0.0).all()
+        assert gap.min() > -1e-7
+        np.testing.assert_allclose(gap[pressure > 0.0], 0.0, atol=1e-7)
+        assert 10 < (pressure == 0.0).sum() < gap.size - 10
+        force.append(float(solution.stats["force_sample"][2]))
+    assert force[0] == pytest.approx(force[1], rel=1e-6 if friction == 0.0 else 1e-5)
+
+
+def test_25_a_penalty_tends_to_hard_contact():
+    """Its error in force falls as 1/stiffness."""
+    hard = press_flat(op.HardOverclosure(exact=True)).stats["force_sample"][2]
+    error = [float(press_flat(op.LinearOverclosure(k)).stats["force_sample"][2] - hard) for k in (30.0, 100.0)]
+    assert error[0] / error[1] == pytest.approx(100.0 / 30.0, rel=0.05)

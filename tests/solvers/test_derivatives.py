@@ -50,9 +50,10 @@ def measure(solution: op.Solution) -> jax.Array:
 
 
 def contacts(numbers: Numbers) -> dict[str, op.Contact]:
+    law = op.ExponentialOverclosure(numbers["p0"], numbers["c0"]) if "p0" in numbers else op.HardOverclosure(exact=True)
     return {
         "window": op.Contact(op.HardOverclosure(), numbers["window_friction"]),
-        "sample": op.Contact(op.ExponentialOverclosure(numbers["p0"], numbers["c0"]), numbers["sample_friction"]),
+        "sample": op.Contact(law, numbers["sample_friction"]),
     }
 
 
@@ -113,6 +114,7 @@ CASES = {
     ),
     "preload, approach taken out": Case(corrected_and_continued, {"c10": 2.2e-3, "map": bump(21), **CONTACT}),
 }
+CASES["hard contact"] = Case(frictional_imprint, {k: v for k, v in FRICTIONAL.items() if k not in ("p0", "c0")})
 CASES["hybrid"] = Case(partial(frictional_imprint, element="hybrid"), FRICTIONAL)
 # Without the map: its difference passes a kink at a step of 1e-4 and is 4e-5 off at 1e-5.
 CASES["tet10"] = Case(
@@ -120,9 +122,7 @@ CASES["tet10"] = Case(
     {name: FRICTIONAL[name] for name in ("L0", "c10", "c01", "bulk", "extent")},
 )
 CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
-SLOW = {
-    name: [pytest.mark.slow] for name in ("preload, approach taken out", "displacement on a spring", "hybrid", "tet10")
-}
+SLOW = {name: [pytest.mark.slow] for name in CASES if name != "friction on both sides"}
 
 
 @partial(jax.jit, static_argnums=0)
@@ -149,7 +149,9 @@ def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
     value, forward, gradient = forward_and_reverse(solve, numbers, direction)
     np.testing.assert_allclose(value, measure(solve(numbers)), SOLVER)
     terms = [float(jnp.vdot(gradient[number], direction[number])) for number in numbers]
-    assert abs(sum(terms) - float(forward)) <= 1e-8 * np.abs(terms).sum()
+    # Linear solves end at 1e-10. Hard contact carries pressure: the error of a gap, times 100 stiffnesses.
+    agreement = 1e-7 if name == "hard contact" else 1e-8
+    assert abs(sum(terms) - float(forward)) <= agreement * np.abs(terms).sum()
     frictionless = name == "no friction"
     for number, value in numbers.items():
         if frictionless and number.endswith("friction"):
