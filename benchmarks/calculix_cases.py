@@ -3,7 +3,7 @@
 Run `python -m benchmarks.calculix_cases SHARED [--only PATTERN] [--element full mean_dilatation]` in the
 repository's root. SHARED is the folder that holds reference/ccx/cases. Prints one JSON line per figure and then
 the table. With `--refine [--elements 8 16 32]` it instead solves the problems of prescribed displacement, and of
-the coin's contact, on finer and finer meshes: where both element forms, and CalculiX's other elements, go.
+contact, on finer and finer meshes: where both element forms, and CalculiX's other elements, go.
 """
 
 import argparse
@@ -222,9 +222,10 @@ def case_names(shared: Path, pattern: str) -> list[str]:
 
 
 def contact_on_mesh(shared: Path, name: str, n: int, element: str) -> tuple[op.Palpation, op.Imprint]:
-    """State a stored contact case of the coin on n × n × n/10 elements."""
+    """State a stored contact case on n elements a side, and through the thickness in the same proportion."""
     palpation, load = statement(shared, name, element)
-    return replace(palpation, elements=(n, n, n // 10), sides="free"), load
+    nx, _, nz = palpation.elements
+    return replace(palpation, elements=(n, n, n * nz // nx)), load
 
 
 def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int] | None) -> None:
@@ -238,6 +239,8 @@ def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int
         )
     for name in case_names(shared, "coin_ccxcontact*") + case_names(shared, "smoothcoin*"):
         problems[name] = ((20, 40, 60), partial(contact_on_mesh, shared, name))
+    for name in case_names(shared, "fricsim*"):
+        problems[name] = ((25, 50, 75), partial(contact_on_mesh, shared, name))
     for name in fnmatch.filter(problems, pattern):
         usual, state = problems[name]
         for element in elements:
@@ -267,7 +270,7 @@ def main() -> None:
     parser.add_argument(
         "--refine",
         action="store_true",
-        help="refine instead: fam_B1 …, coin_slip, coin_bonded …, coin_ccxcontact…",
+        help="refine instead: fam_B1 …, coin_slip, coin_bonded …, coin_ccxcontact…, smoothcoin…, fricsim…",
     )
     parser.add_argument("--elements", type=int, nargs="+", help="meshes of the refinement, elements per side")
     chosen = parser.parse_args()

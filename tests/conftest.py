@@ -25,6 +25,14 @@ def _compiled_code_is_released():
     jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def _compiled_code_of_a_slow_test_is_released(request):
+    """A module of derivatives alone compiles more than a process may map."""
+    yield
+    if request.node.get_closest_marker("slow"):
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of reference data that is kept outside the repository, beside its root."""

@@ -27,7 +27,8 @@ class Palpation(eqx.Module):
         elements: (nx, ny, nz).
         window: `Contact`, `Bonded` or `Roller` at z = 0.
         sample: The same at the sample–layer interface.
-        sides: "free", "roller", or a dict of these by x0, x1, y0, y1 (missing ones are free).
+        sides: "free", "roller", a dict of these by x0, x1, y0, y1 (missing ones are free), or all four in this
+            order, as they are kept (so that `dataclasses.replace` works).
         element: How an element measures strain. Hexahedra: "mean_dilatation" (locking-free up to a bulk
             modulus of about 1000 shear moduli), "hybrid" (the same with the mean stress as an unknown: any
             bulk modulus, also `jnp.inf`), "full" (2×2×2 points; locks), "reduced" (one point with hourglass
@@ -59,7 +60,7 @@ class Palpation(eqx.Module):
         elements: tuple[int, int, int],
         window: Side,
         sample: Side,
-        sides: str | Mapping[str, str] = "free",
+        sides: str | Mapping[str, str] | tuple[str, str, str, str] = "free",
         element: Element = "mean_dilatation",
         hold=None,
     ):
@@ -104,8 +105,13 @@ class Palpation(eqx.Module):
         return LayerMesh(self.layer.thickness_at(*flat.plane()), self.extent, nz)
 
 
-def _sides(sides: str | Mapping[str, str]) -> tuple[str, str, str, str]:
-    chosen = dict.fromkeys(SIDES, sides) if isinstance(sides, str) else {**dict.fromkeys(SIDES, "free"), **sides}
-    if set(chosen) != set(SIDES) or not set(chosen.values()) <= {"free", "roller"}:
+def _sides(sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, str, str]:
+    if isinstance(sides, str):
+        chosen = (sides,) * len(SIDES)
+    elif isinstance(sides, Mapping) and set(sides) <= set(SIDES):
+        chosen = tuple(sides.get(side, "free") for side in SIDES)
+    else:
+        chosen = tuple(sides)
+    if len(chosen) != len(SIDES) or not set(chosen) <= {"free", "roller"}:
         raise ValueError(f'Palpation.sides must be "free", "roller" or a dict of these by {SIDES}, got {sides!r}.')
-    return chosen["x0"], chosen["x1"], chosen["y0"], chosen["y1"]
+    return chosen

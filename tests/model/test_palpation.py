@@ -21,6 +21,7 @@ def palpation(**changes):
         ({}, ("free", "free", "free", "free")),
         ({"y0": "roller"}, ("free", "free", "roller", "free")),
         ({"x1": "roller", "y1": "roller", "x0": "free"}, ("free", "roller", "free", "roller")),
+        (("free", "roller", "free", "roller"), ("free", "roller", "free", "roller")),
     ],
 )
 def test_sides(sides, expected):
@@ -59,6 +60,7 @@ def test_whole_numbers_of_another_type_are_counts(elements, annotations_unchecke
         ({"sample": op.HardOverclosure()}, r"Palpation\.sample must be Bonded\(\), Roller\(\) or Contact"),
         ({"element": "quadratic"}, r"Palpation\.element must be one of .*'full'.*, got 'quadratic'\."),
         ({"sides": "fixed"}, r'Palpation\.sides must be "free", "roller" or a dict .*, got \'fixed\'\.'),
+        ({"sides": ("free", "roller")}, r"Palpation\.sides must be .* got \('free', 'roller'\)\."),
         ({"sides": {"z0": "roller"}}, r"a dict of these by \('x0', 'x1', 'y0', 'y1'\), got \{'z0': 'roller'\}\."),
         ({"sides": {"x0": "fixed"}}, r"Palpation\.sides must be .* got \{'x0': 'fixed'\}\."),
         ({"hold": 0.0}, r"Palpation\.hold \[N/mm\] must be positive, got 0\.0\."),
