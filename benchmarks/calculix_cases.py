@@ -229,7 +229,10 @@ def contact_on_mesh(shared: Path, name: str, n: int, element: str) -> tuple[op.P
 
 
 def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int] | None) -> None:
-    """Solve problems on finer and finer meshes; print every figure and its limit."""
+    """Solve problems on finer and finer meshes; print every figure, its limit, and how the stress maps close in.
+
+    Maps, averaged over the elements of the coarsest mesh, are held against the finest of the last element form.
+    """
     coin = {"coin_slip": (False, 0.11732), "coin_slip_k200": (False, 1.1732), "coin_bonded": (True, 0.11732)}
     problems = {f"fam_{v}": ((8, 16, 24, 32, 48), partial(cases.formula_family, v)) for v in ("B1", "B2", "B3")}
     for name, about in coin.items():
@@ -243,17 +246,30 @@ def refinement(shared: Path, pattern: str, elements: list[str], meshes: list[int
         problems[name] = ((25, 50, 75), partial(contact_on_mesh, shared, name))
     for name in fnmatch.filter(problems, pattern):
         usual, state = problems[name]
+        maps = {}
         for element in elements:
             found = {}
             for n in meshes or usual:
                 solution = op.solve(*state(n, element), throw=False, progress=False)
                 values = described(solution, name)
+                maps[element, n] = values["S33 map"]
                 found[n] = {q: float(values[q]) for q in UNITS if np.ndim(values.get(q, [])) == 0}
                 print(json.dumps({"problem": name, "element": element, "n": n} | found[n]), flush=True)
                 jax.clear_caches()
             for three in [(n, 2 * n, 4 * n) for n in found if {2 * n, 4 * n} <= set(found)]:
                 limits = {quantity: limit(*(found[n][quantity] for n in three)) for quantity in found[three[0]]}
                 print(json.dumps({"problem": name, "element": element, "limit_of": three} | limits), flush=True)
+        cells = min(len(values) for values in maps.values())
+        finest = averaged(maps[elements[-1], max(meshes or usual)], cells)
+        for (element, n), values in maps.items():
+            off = cases.relative_error(averaged(values, cells), finest)
+            print(json.dumps({"problem": name, "element": element, "n": n, "S33 map from the finest": off}), flush=True)
+
+
+def averaged(values: np.ndarray, cells: int) -> np.ndarray:
+    """Average a map over cells × cells parts, for comparing meshes."""
+    split = [np.array_split(np.arange(n), cells) for n in values.shape]
+    return np.array([[values[np.ix_(rows, columns)].mean() for columns in split[1]] for rows in split[0]])
 
 
 def limit(coarse: float, middle: float, fine: float) -> float:
