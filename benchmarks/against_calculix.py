@@ -30,7 +30,6 @@ from tests.reference import cases
 CASES = ("coin_ccxcontact_top_mu0_bottom_slip_C3D8", "coin_ccxcontact_muwin0p15_mutop0p05_lam0p02_C3D8")
 # In-plane springs [N/mm] under the layer: without them a frictionless layer could drift without end.
 SPRING = 1e-7
-IMPRINT, WINDOW, SPRINGS = 1_000_000, 2_000_000, 3_000_000  # first numbers of nodes and elements of each
 
 
 def deck(palpation: op.Palpation, load: op.Imprint) -> str:
@@ -72,7 +71,7 @@ def _layer(palpation: op.Palpation) -> Iterator[str]:
     yield f"{material.c10}, {material.c01}, {2.0 / material.bulk:.12g}"
     yield from ("*SOLID SECTION, ELSET=ELAY, MATERIAL=LAYER", "*MATERIAL, NAME=RIGID", "*ELASTIC", "1., 0.")
     for direction in (1, 2):
-        springs = SPRINGS * direction + number[0].ravel()
+        springs = nx * ny * nz + (direction - 1) * number[0].size + number[0].ravel()
         yield f"*ELEMENT, TYPE=SPRING1, ELSET=ESPRING{direction}"
         yield from _rows(springs, number[0].reshape(-1, 1))
         yield from (f"*SPRING, ELSET=ESPRING{direction}", str(direction), f"{SPRING:.6E}")
@@ -83,11 +82,18 @@ def _layer_nodes(palpation: op.Palpation) -> np.ndarray:
     return 1 + np.arange((nz + 1) * (ny + 1) * (nx + 1)).reshape(nz + 1, ny + 1, nx + 1)
 
 
+def _rigid_number(palpation: op.Palpation) -> int:
+    """First number of nodes and elements of the rigid bodies: beyond the layer's. CalculiX's memory grows with it."""
+    nx, ny, nz = palpation.elements
+    return (nx + 1) * (ny + 1) * (nz + 3) + 1
+
+
 def _imprint(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
     thickness = load.thickness
     y, x = (coordinates.ravel() for coordinates in np.meshgrid(thickness.y, thickness.x, indexing="ij"))
     z = np.full(x.size, float(palpation.layer.thickness))
-    nodes = IMPRINT + np.arange(2 * x.size)
+    first = _rigid_number(palpation) + 8  # after the window's
+    nodes = first + np.arange(2 * x.size)
     yield "*NODE, NSET=NIMP"
     yield from _rows(nodes, np.stack([np.tile(x, 2), np.tile(y, 2), np.concatenate([z, z + 0.5])], axis=1))
     low, high = nodes.reshape(2, *thickness.values.shape)
@@ -99,7 +105,7 @@ def _imprint(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
     )
     corners = np.stack([face[at].ravel() for face in (low, high) for at in around], axis=1)
     yield "*ELEMENT, TYPE=C3D8, ELSET=EIMP"
-    yield from _rows(IMPRINT + np.arange(len(corners)), corners)
+    yield from _rows(first + np.arange(len(corners)), corners)
     yield from ("*SOLID SECTION, ELSET=EIMP, MATERIAL=RIGID", "*SURFACE, NAME=SIMP", "EIMP, S1")
     yield from _contact(palpation.sample, "TOP", "STOP, SIMP")
 
@@ -107,13 +113,14 @@ def _imprint(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
 def _window(palpation: op.Palpation) -> Iterator[str]:
     if isinstance(palpation.window, op.Roller):
         return
+    first = _rigid_number(palpation)
     width, depth = np.asarray(palpation.extent)
     ends = [(-width, -depth), (2 * width, -depth), (2 * width, 2 * depth), (-width, 2 * depth)]
     yield "*NODE, NSET=NWIN"
-    yield from _rows(WINDOW + np.arange(8), np.array([(*end, z) for z in (-1.0, 0.0) for end in ends]))
+    yield from _rows(first + np.arange(8), np.array([(*end, z) for z in (-1.0, 0.0) for end in ends]))
     yield "*ELEMENT, TYPE=C3D8, ELSET=EWIN"
-    yield from _rows([WINDOW], WINDOW + np.arange(8)[None])
-    yield from ("*SOLID SECTION, ELSET=EWIN, MATERIAL=RIGID", "*SURFACE, NAME=SWIN", f"{WINDOW}, S2")
+    yield from _rows([first], first + np.arange(8)[None])
+    yield from ("*SOLID SECTION, ELSET=EWIN, MATERIAL=RIGID", "*SURFACE, NAME=SWIN", f"{first}, S2")
     yield from _contact(palpation.window, "BOTTOM", "SBOT, SWIN")
 
 
@@ -137,7 +144,8 @@ def _steps(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
         middle = _layer_nodes(palpation)[0, ny // 2]
         yield from ("NWIN, 1, 3", f"{middle[nx // 2]}, 1, 2", f"{middle[nx // 2 + max(nx // 20, 1)]}, 2, 2")
     yield from ("*STEP, NLGEOM, INC=400", "*STATIC", "0.1, 1., 1e-5, 0.15", "*BOUNDARY")
-    yield from (f"{IMPRINT + node}, 3, 3, {value:.9g}" for node, value in enumerate(uz))
+    first = _rigid_number(palpation) + 8
+    yield from (f"{first + node}, 3, 3, {value:.9g}" for node, value in enumerate(uz))
     yield from ("*NODE PRINT, NSET=NIMP, TOTALS=ONLY, FREQUENCY=100000", "RF")
     yield from ("*EL PRINT, ELSET=ETOP, FREQUENCY=100000", "S", "*END STEP", "")
 
