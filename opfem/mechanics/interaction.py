@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ..model import Contact, HeightField
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
+from .staging import apart
 
 # Share of the largest elastic slip from which a point counts as slipping.
 _AT_LIMIT = 0.9
@@ -332,9 +333,13 @@ class ContactFace(eqx.Module):
             point = self.at_points(fraction, moved, history, at_law)
             return point.traction, point
 
-        now, change, point = jax.linearize(traction, position, has_aux=True)
-        unit = jnp.eye(3, dtype=x.dtype).reshape(3, 3, *[1] * (position.ndim - 1))
-        by_position = jax.vmap(change)(jnp.broadcast_to(unit, (3, *position.shape)))  # j, i, points
+        def linearised(position):
+            now, change, point = jax.linearize(traction, position, has_aux=True)
+            unit = jnp.eye(3, dtype=x.dtype).reshape(3, 3, *[1] * (position.ndim - 1))
+            by_position = jax.vmap(change)(jnp.broadcast_to(unit, (3, *position.shape)))  # j, i, points
+            return now, by_position, point
+
+        now, by_position, point = apart(linearised, position)
         area, pull_back = jax.vjp(self._area, jnp.stack(tangents))
         (by_tangents,) = pull_back(jnp.broadcast_to(1.0 if law is None else law.curvature, area.shape))
         slopes = jnp.concatenate([(by_position * area)[None], by_tangents[:, :, None] * now])

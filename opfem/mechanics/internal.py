@@ -11,6 +11,7 @@ The forms differ in what of the deformation their cells measure:
 """
 
 import itertools
+from functools import partial
 from typing import Literal
 
 import equinox as eqx
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import AbstractMaterial, LayerMesh
-from ..model.deformation import Kinematics, identity_like, kinematics, outer
+from ..model.deformation import Kinematics, ProductSum, identity_like, kinematics
 from .kinematics import AbstractCells, LayerCells, layer_cells
 
 Form = Literal["full", "mean_dilatation", "hybrid", "reduced"]
@@ -62,7 +63,9 @@ class SolidBody(eqx.Module):
             P = P + self._hourglass_stiffness * (H - self.cells.mean(H, 2))
         return self.cells.assemble(self.cells.nodal_vectors(P * self.cells.weight)), jnp.min(k.J)
 
-    def cell_stiffness(self, u: Array, mean_stress: Array | None = None, bulk: Array | None = None) -> Array:
+    def cell_stiffness(
+        self, u: Array, mean_stress: Array | None = None, bulk: Array | None = None, more: Array | None = None
+    ) -> Array:
         """Compute the stiffness [N/mm] of each cell, K[a, b, i, k] = df[a, i]/du[b, k].
 
         Args:
@@ -70,22 +73,19 @@ class SolidBody(eqx.Module):
             mean_stress: For `hybrid`.
             bulk: For `hybrid`: stiffness of each cell's volume [MPa] that is added to the stiffness at
                 constant mean stress; None: none.
+            more: Stiffness [N/mm] that is added to every cell's, `(a, b, 3, 3)`; None: none.
 
         Returns:
             `(a, b, 3, 3, *cells)`; in a layer, layers first: `(nz, a, b, 3, 3, ny, nx)`.
         """
         fields = () if mean_stress is None else (mean_stress,)
-
-        def part(cells, H, *fields):
-            return self._stiffness(cells, H, bulk, *fields)
-
-        return self.cells.in_parts(part, u, *fields)
+        return self.cells.in_parts(self._tangent, partial(self._stiffness, bulk=bulk, more=more), u, *fields)
 
     def point_tangent(self, u: Array) -> Float[Array, "3 3 3 3 points *cells"]:
         """Compute dP/dF times the points' volumes [N mm], of a form that measures at each point."""
         assert self.form == "full"
         k, weight = self._measured(self.cells, self.cells.displacement_gradient(u))
-        return self._full_tangent(k) * weight
+        return self._full_tangent(k).entries() * weight
 
     def volume_residual(self, u: Array, mean_stress: Array) -> Array:
         """Compute V (mean J - 1 - mean stress/bulk) of each cell [mm³], zero in a `hybrid` equilibrium."""
@@ -118,6 +118,10 @@ class SolidBody(eqx.Module):
             return kinematics(cells.mean(H, 2)), cells.volume
         return kinematics(H), cells.weight
 
+    @property
+    def _of_mean_volume(self) -> bool:
+        return self.form in ("mean_dilatation", "hybrid")
+
     def _mean_stress(self, cells: AbstractCells, k: Kinematics, mean_stress: Array | None) -> Array:
         if self.form == "hybrid":
             assert mean_stress is not None
@@ -125,28 +129,44 @@ class SolidBody(eqx.Module):
         return self.material.volumetric_stress(self._volume_change(cells, k))
 
     def _volume_change(self, cells: AbstractCells, k: Kinematics) -> Array:
-        return cells.mean(k.volume_change) if self.form in ("mean_dilatation", "hybrid") else k.volume_change
+        return cells.mean(k.volume_change) if self._of_mean_volume else k.volume_change
 
     def _energy_density(self, k: Kinematics, mean_stress: Array | None) -> Array:
         change = self._volume_change(self.cells, k)
         volumetric = self.material.volumetric_energy(change) if mean_stress is None else 0.5 * mean_stress * change
         return self.material.isochoric_energy(k) + volumetric
 
-    def _full_tangent(self, k: Kinematics) -> Array:
+    def _full_tangent(self, k: Kinematics) -> ProductSum:
         A = self.material.tangent(k, self.material.volumetric_stress(k.volume_change))
-        return A + (self.material.bulk * k.J**2) * outer(k.G, k.G)
+        return A + ProductSum(direct=((self.material.bulk * k.J**2, k.G, k.G),))
 
-    def _stiffness(self, cells: AbstractCells, H: Array, bulk: Array | None, mean_stress: Array | None = None) -> Array:
+    def _tangent(
+        self, cells: AbstractCells, H: Array, mean_stress: Array | None = None
+    ) -> tuple[ProductSum, Array | None]:
+        """Compute the tangent times volume at the points, and the derivative of the cells' volumes by their nodes.
+
+        The latter is None for forms that do not need it.
+        """
         k, weight = self._measured(cells, H)
-        if self.form == "reduced":
-            return self._reduced_stiffness(cells, k)
-        if self.form == "full":
-            return cells.matrices(self._full_tangent(k) * weight)
-        K = cells.matrices(self.material.tangent(k, self._mean_stress(cells, k, mean_stress)) * weight)
+        if self._of_mean_volume:
+            A = self.material.tangent(k, self._mean_stress(cells, k, mean_stress))
+            return cells.referred(A.scaled(weight)), cells.nodal_vectors(k.J * k.G * weight)
+        A = self._full_tangent(k)
+        if self.form == "reduced":  # what holds the hourglass modes does not hold the mean strain
+            A = A + self._held(-self._hourglass_stiffness, k.F)
+            return A.scaled(weight), None
+        return cells.referred(A.scaled(weight)), None
+
+    def _stiffness(
+        self, cells: AbstractCells, parts: tuple[ProductSum, Array | None], bulk: Array | None, more: Array | None
+    ) -> Array:
+        A, dv = parts
+        K = self._reduced_stiffness(cells, A) if self.form == "reduced" else cells.matrices(A)
+        if more is not None:
+            K = K + jnp.expand_dims(more, tuple(range(4, K.ndim)))
         stiffness = bulk if self.form == "hybrid" else self.material.bulk
-        if stiffness is None:
+        if stiffness is None or dv is None:
             return K
-        dv = cells.nodal_vectors(k.J * k.G * weight)
         return K + (stiffness / cells.volume[0]) * (dv[:, None, :, None] * dv[None, :, None, :])
 
     @property
@@ -159,14 +179,19 @@ class SolidBody(eqx.Module):
         deviation = H - self.cells.mean(H, 2)
         return 0.5 * self._hourglass_stiffness * jnp.sum(deviation**2 * self.cells.weight)
 
-    def _reduced_stiffness(self, cells: AbstractCells, k: Kinematics) -> Array:
-        eye = identity_like(k.F)
+    def _held(self, stiffness: Array, like: Array) -> ProductSum:
+        """Build the tangent of a stiffness that holds every entry of F, at points like those of a tensor."""
+        eye = jnp.broadcast_to(identity_like(like), like.shape)
+        return ProductSum(legs=((jnp.broadcast_to(stiffness, like.shape[2:]), eye, eye),))
+
+    def _reduced_stiffness(self, cells: AbstractCells, A: ProductSum) -> Array:
+        nothing = jnp.zeros((3, 3, *cells.weight.shape), cells.weight.dtype)
+        eye, held = identity_like(nothing), self._held(self._hourglass_stiffness, nothing)
+        K = cells.matrices(cells.referred(held.scaled(cells.weight)))
         mean = cells.nodal_vectors(eye * (cells.weight / cells.volume))  # mean dN_a/dX_J `(a, J, *cells)`
-        held = self._hourglass_stiffness * (eye[:, None, :, None] * eye[None, :, None, :])
-        A = ((self._full_tangent(k) - held) * cells.volume)[:, :, :, :, 0]
-        K = cells.matrices(held * cells.weight)
+        own = A.entries()[:, :, :, :, 0]
         for J, L in itertools.product(range(3), repeat=2):
-            K = K + mean[:, None, None, None, J] * A[None, None, :, J, :, L] * mean[None, :, None, None, L]
+            K = K + mean[:, None, None, None, J] * own[None, None, :, J, :, L] * mean[None, :, None, None, L]
         return K
 
 

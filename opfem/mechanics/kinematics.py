@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import LayerMesh
+from ..model.deformation import ProductSum
 from .hex8 import CORNERS, GAUSS_POINTS, GRADIENTS, assemble, gather
+from .staging import apart
 from .tet import EDGES, FOUR_POINTS, kuhn_tetrahedra, linear_gradients, quadratic_gradients
 
 
@@ -47,9 +49,9 @@ class CellKind(NamedTuple):
 
     @property
     def pairs(self) -> np.ndarray:
-        """D_aα D_bβ by points: sums over points are one matrix product: `(a, b, q · 3 α · 3 β)`."""
+        """D_aα D_bβ by points: sums over points are one matrix product: `(a, b, 3 α · 3 β · q)`."""
         n = len(self.nodes)
-        return np.einsum("qma,qnb->abqmn", self.gradients, self.gradients).reshape(n, n, -1)
+        return np.einsum("qma,qnb->abmnq", self.gradients, self.gradients).reshape(n, n, -1)
 
 
 def _tetrahedra(span: int) -> CellKind:
@@ -97,13 +99,24 @@ class AbstractCells(eqx.Module):
         """Add the nodal values of the cells into nodes."""
         raise NotImplementedError
 
-    def matrices(self, tangent: Float[Array, "3 3 3 3 points *cells"]) -> Float[Array, "a b 3 3 *cells"]:
-        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell."""
+    def referred(self, tangent: ProductSum) -> ProductSum:
+        """Turn the axes J and L of tangent[i, J, k, L] into those that `matrices` sums along."""
         raise NotImplementedError
 
-    def in_parts(self, function: Callable, u: Array, *fields: Any) -> Any:
-        """Evaluate function(cells, displacement gradient, fields) for parts of the mesh: here in one."""
-        return function(self, self.displacement_gradient(u), *fields)
+    def matrices(self, tangent: ProductSum) -> Float[Array, "a b 3 3 *cells"]:
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell.
+
+        Args:
+            tangent: `referred`, times `weight` [N mm]; symmetric, as an energy's is.
+
+        Returns:
+            Stiffness of every cell [N/mm]: force on (a, i) by displacement of (b, k).
+        """
+        raise NotImplementedError
+
+    def in_parts(self, prepare: Callable, finish: Callable, u: Array, *fields: Any) -> Any:
+        """Evaluate finish(cells, prepare(cells, displacement gradient, fields)) for parts of the mesh: here in one."""
+        return finish(self, prepare(self, self.displacement_gradient(u), *fields))
 
     def mean(self, values: Float[Array, "*components_points_cells"], components: int = 0) -> Array:
         """Average over the reference volume of each cell, keeping an axis of one point."""
@@ -191,29 +204,46 @@ class LayerCells(AbstractCells):
         flux = jnp.transpose(self._to_reference(stress), (2, 1, 0, 3, 4, 5))
         return contract(self.kind.from_points, flux.reshape(-1, *flux.shape[2:]))
 
-    def matrices(self, tangent: Float[Array, "3 3 3 3 points nz ny nx"]) -> Float[Array, "a b 3 3 nz ny nx"]:
-        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell."""
-        A = self._to_reference(self._to_reference(tangent, axis=1), axis=3)
-        A = jnp.transpose(A, (4, 1, 3, 0, 2, 5, 6, 7))
-        return contract(self.kind.pairs, A.reshape(-1, *A.shape[3:]))
+    def referred(self, tangent: ProductSum) -> ProductSum:
+        """Turn the axes J and L of tangent[i, J, k, L] into ξ."""
+        return tangent.referred(self._to_reference)
 
-    def in_parts(self, function: Callable, u: Float[Array, "3 mz my mx"], *fields: Any) -> Any:
-        """Evaluate function(cells, displacement gradient, fields) one layer of cells at a time.
+    def matrices(self, tangent: ProductSum) -> Float[Array, "a b 3 3 nz ny nx"]:
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell: six blocks of nine."""
 
-        So what it holds stays in the cache. Results come layers first.
+        def block(i, k):
+            A = tangent.block(i, k)
+            return contract(self.kind.pairs, A.reshape(-1, *A.shape[3:]))
+
+        upper = {(i, k): block(i, k) for i in range(3) for k in range(i, 3)}
+        lower = {(k, i): jnp.swapaxes(K, 0, 1) for (i, k), K in upper.items()}
+        blocks = lower | upper
+        return jnp.stack([jnp.stack([blocks[i, k] for k in range(3)], axis=2) for i in range(3)], axis=2)
+
+    def in_parts(self, prepare: Callable, finish: Callable, u: Float[Array, "3 mz my mx"], *fields: Any) -> Any:
+        """Evaluate finish(cells, prepare(cells, displacement gradient, fields)) one layer of cells at a time.
+
+        So what it holds stays in the cache; cells lie along one axis, so that loops are long. Results come
+        layers first.
         """
+        nz, ny, nx = self.slope_x.shape[1:]
         whole = [self.gather(u), self.slope_x, self.slope_y, *fields]
         if self.depth.shape[1] > 1:
             whole.append(self.depth)
+        flat = [jnp.moveaxis(v, -3, 0).reshape(nz, *v.shape[:-3], 1, 1, ny * nx) for v in whole]
+        depth = self.depth.reshape(-1, self.depth.shape[1], 1, ny * nx)
+
+        def at_gradient(cells, nodal, *fields):
+            return prepare(cells, cells._gradient(nodal), *fields)
 
         def one_layer(layer):
-            nodal, slope_x, slope_y, *rest = (jnp.expand_dims(v, v.ndim - 2) for v in layer)
-            depth = rest.pop() if self.depth.shape[1] > 1 else self.depth
-            cells = LayerCells(self.spacing, depth, slope_x, slope_y, self.name)
-            return function(cells, cells._gradient(nodal), *rest)
+            nodal, slope_x, slope_y, *rest = layer
+            own = rest.pop() if self.depth.shape[1] > 1 else depth
+            cells = LayerCells(self.spacing, own, slope_x, slope_y, self.name)
+            return finish(cells, apart(at_gradient, cells, nodal, *rest))
 
-        results = jax.lax.map(one_layer, [jnp.moveaxis(v, -3, 0) for v in whole])
-        return jax.tree.map(lambda v: jnp.squeeze(v, axis=-3), results)
+        results = jax.lax.map(one_layer, flat)
+        return jax.tree.map(lambda v: v.reshape(*v.shape[:-3], ny, nx), results)
 
     def element_mean(self, values: Float[Array, "*components points cz cy cx"], volume: Array) -> Array:
         """Average a field over the reference volume [mm³] of each cell: `(*components, nz, ny, nx)`.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._checks import concrete
-from ..model.deformation import cofactor
+from ..model.deformation import ProductSum, cofactor
 from .hex8 import GAUSS_POINTS, GRADIENTS
 from .kinematics import AbstractCells
 from .tet import FOUR_POINTS, linear_gradients, quadratic_gradients
@@ -77,17 +77,14 @@ class UnstructuredCells(AbstractCells):
         padded = jnp.pad(flat, ((0, 0), (0, 1)))
         return jnp.sum(jnp.take(padded, jnp.asarray(self.incidence), axis=1), axis=-1)
 
-    def matrices(self, tangent: Float[Array, "3 3 3 3 points elements"]) -> Float[Array, "a b 3 3 elements"]:
-        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points.
+    def referred(self, tangent: ProductSum) -> ProductSum:
+        """Leave the axes of X as they are."""
+        return tangent
 
-        Args:
-            tangent: dP[i, J]/dF[k, L] times `weight` [N mm].
-
-        Returns:
-            Stiffness of every cell [N/mm]: force on (a, i) by displacement of (b, k).
-        """
+    def matrices(self, tangent: ProductSum) -> Float[Array, "a b 3 3 elements"]:
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell."""
         # Letters: a, b nodes; i, k current axes; J, L reference axes; q points; e cells.
-        by_node = jnp.einsum("aJqe,iJkLqe->aikLqe", self.dN_dX, tangent)
+        by_node = jnp.einsum("aJqe,iJkLqe->aikLqe", self.dN_dX, tangent.entries())
         return jnp.einsum("aikLqe,bLqe->abike", by_node, self.dN_dX)
 
 

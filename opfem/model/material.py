@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_finite, check_modulus, check_positive
-from .deformation import Kinematics, Tensor, identity_like, kinematics, outer, product, transpose
+from .deformation import Kinematics, ProductSum, Tensor, identity_like, kinematics, product, transpose
 
 
 class AbstractMaterial(eqx.Module):
@@ -30,7 +30,7 @@ class AbstractMaterial(eqx.Module):
         """Compute the isochoric part of the first Piola–Kirchhoff stress [MPa]."""
         raise NotImplementedError
 
-    def isochoric_tangent(self, k: Kinematics) -> Float[Array, "3 3 3 3 *points"]:
+    def isochoric_tangent(self, k: Kinematics) -> ProductSum:
         """Compute the derivative of `isochoric_piola` by F [MPa]: A[i, J, k, L] = dP[i, J]/dF[k, L]."""
         raise NotImplementedError
 
@@ -56,13 +56,15 @@ class AbstractMaterial(eqx.Module):
         """
         return self.isochoric_piola(k) + (mean_stress * k.J) * k.G
 
-    def tangent(self, k: Kinematics, mean_stress: Array) -> Float[Array, "3 3 3 3 *points"]:
+    def tangent(self, k: Kinematics, mean_stress: Array) -> ProductSum:
         """Compute A[i, J, k, L] = dP[i, J]/dF[k, L] [MPa] at constant dU/dJ.
 
         The stiffness of U itself, U'' cof F ⊗ cof F, is left to the element form: it acts on
         the point's volume or on the element's.
         """
-        return self.isochoric_tangent(k) + (mean_stress * k.J) * (outer(k.G, k.G) - _crossed(k.G))
+        pressure = mean_stress * k.J
+        geometric = ProductSum(direct=((pressure, k.G, k.G),), crossed=((-pressure, k.G, k.G),))
+        return self.isochoric_tangent(k) + geometric
 
 
 class AbstractInvariantMaterial(AbstractMaterial):
@@ -91,31 +93,26 @@ class AbstractInvariantMaterial(AbstractMaterial):
         a, b, D, pull = self._terms(k)
         return 2.0 * (a * k.F + b * D) - pull * k.G
 
-    def isochoric_tangent(self, k: Kinematics) -> Float[Array, "3 3 3 3 *points"]:
+    def isochoric_tangent(self, k: Kinematics) -> ProductSum:
         """Compute the derivative of `isochoric_piola` by F [MPa]."""
         a, b, D, pull = self._terms(k)
-        eye = identity_like(k.F)
         F, G, C = k.F, k.G, k.C
         B = product(F, transpose(F))
-        same = eye[:, None, :, None] * eye[None, :, None, :]
-        stretch = 4.0 / 3.0 * (a * F + 2.0 * b * D)
-        tangent = (
-            (2.0 * (a + b * k.I1)) * same
-            + (4.0 * b) * outer(F, F)
-            - (2.0 * b) * (eye[:, None, :, None] * C[None, :, None, :])
-            - (2.0 * b) * (F[:, None, None, :] * transpose(F)[None, :, :, None])
-            - (2.0 * b) * (B[:, None, :, None] * eye[None, :, None, :])
-            - outer(stretch, G)
-            - outer(G, stretch)
-            + (4.0 / 9.0 * (a * k.I1 + 4.0 * b * k.I2)) * outer(G, G)
-            + pull * _crossed(G)
+        eye = jnp.broadcast_to(identity_like(F), F.shape)
+        one = jnp.ones_like(a)
+        # With half of what is along G ⊗ G, so that this takes no term of its own.
+        stretch = 4.0 / 3.0 * (a * F + 2.0 * b * D) - 2.0 / 9.0 * (a * k.I1 + 4.0 * b * k.I2) * G
+        tangent = ProductSum(
+            direct=((4.0 * b, F, F), (-one, stretch, G), (-one, G, stretch)),
+            crossed=((-2.0 * b, F, F), (pull, G, G)),
+            legs=((one, 2.0 * (a + b * k.I1) * eye - 2.0 * b * B, eye), (-2.0 * b, eye, C)),
         )
         j = k.J ** (-2.0 / 3.0)
         curvature = self.curvature(j * k.I1 - 3.0)
         if curvature is None:
             return tangent
         slope = (2.0 * j) * (F - (k.I1 / 3.0) * G)  # dĪ1/dF
-        return tangent + curvature * outer(slope, slope)
+        return tangent + ProductSum(direct=((curvature, slope, slope),))
 
     def _terms(self, k: Kinematics) -> tuple[Array, Array, Tensor, Array]:
         j = k.J ** (-2.0 / 3.0)
@@ -228,8 +225,3 @@ class Yeoh(AbstractInvariantMaterial):
         """Compute the isochoric part of the energy density [MPa]."""
         x = k.J ** (-2.0 / 3.0) * k.I1 - 3.0
         return ((self.c30 * x + self.c20) * x + self.c10) * x
-
-
-def _crossed(G: Tensor) -> Float[Array, "3 3 3 3 *points"]:
-    """Form G[i, L] G[k, J], minus the derivative of G by F."""
-    return G[:, None, None, :] * transpose(G)[None, :, :, None]

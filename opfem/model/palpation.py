@@ -113,5 +113,9 @@ def _sides(sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, 
     else:
         chosen = tuple(sides)
     if len(chosen) != len(SIDES) or not set(chosen) <= {"free", "roller"}:
-        raise ValueError(f'Palpation.sides must be "free", "roller" or a dict of these by {SIDES}, got {sides!r}.')
-    return chosen
+        raise ValueError(
+            f'Palpation.sides must be "free", "roller", a dict of these by {SIDES} or one for each of them, '
+            f"got {sides!r}."
+        )
+    x0, x1, y0, y1 = chosen
+    return x0, x1, y0, y1

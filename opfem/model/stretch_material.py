@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_finite, check_modulus, check_positive, concrete
-from .deformation import Kinematics, Tensor, identity_like, product, transpose
+from .deformation import Kinematics, ProductSum, Tensor, identity_like, product, transpose
 from .material import AbstractMaterial
 
 _SWEEPS = 6  # of Jacobi's method on 3×3: it converges quadratically, and five reach rounding
@@ -52,24 +52,25 @@ class AbstractStretchMaterial(AbstractMaterial):
         """Compute the isochoric part of the first Piola–Kirchhoff stress [MPa]."""
         return product(k.F, _second_piola(self, k.C))
 
-    def isochoric_tangent(self, k: Kinematics) -> Float[Array, "3 3 3 3 *points"]:
+    def isochoric_tangent(self, k: Kinematics) -> ProductSum:
         """Compute the derivative of `isochoric_piola` by F [MPa]."""
         squares, N = _spectrum(k.C)
         principal = _principal(self, squares)
         n = product(k.F, N)
-        S = _assemble(principal.stress, N)
+        one = jnp.ones_like(squares[0])
+
+        def dyad(a, b):
+            return n[:, None, a] * N[None, :, b]
+
         # Geometric part, then dS: axes (i, a), (J, a), (k, b), (L, b) meet in the principal frame.
-        tangent = identity_like(k.F)[:, None, :, None] * S[None, :, None, :]
-        dyads = n[:, None] * N[None, :]  # (i, J, a)
-        normal = jnp.sum(principal.normal[None, None] * dyads[:, :, None], axis=3)  # (k, L, a), summed over b
-        tangent = tangent + sum(dyads[:, :, None, None, a] * normal[None, None, :, :, a] for a in range(3))
-        for a in range(3):
-            for b in range(3):
-                if a != b:
-                    mixed = n[:, None, a] * N[None, :, b]
-                    both = mixed + n[:, None, b] * N[None, :, a]
-                    tangent = tangent + principal.shear[a, b] * (mixed[:, :, None, None] * both[None, None])
-        return tangent
+        geometric = ProductSum(
+            legs=((one, jnp.broadcast_to(identity_like(k.F), k.F.shape), _assemble(principal.stress, N)),)
+        )
+        dyads = [dyad(a, a) for a in range(3)]
+        zero = jnp.zeros_like(k.F)
+        normal = [(one, dyads[a], sum((principal.normal[a, b] * dyads[b] for b in range(3)), zero)) for a in range(3)]
+        pairs = [(principal.shear[a, b], dyad(a, b) + dyad(b, a)) for a, b in ((0, 1), (0, 2), (1, 2))]
+        return geometric + ProductSum(direct=(*normal, *((shear, both, both) for shear, both in pairs)))
 
 
 class Ogden(AbstractStretchMaterial):

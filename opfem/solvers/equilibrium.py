@@ -16,8 +16,9 @@ from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, 
 from ..mechanics.face import tributary_area
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
+from .multigrid import build_multigrid
 from .stencil import Nodal
-from .tangent import Tangent, Unknowns, VolumeCoupling, assemble_tangent
+from .tangent import Tangent, Unknowns, VolumeCoupling
 
 
 class Supports(NamedTuple):
@@ -268,6 +269,7 @@ class Problem(eqx.Module):
         modes = self.drift_modes()
         if modes is None:
             return jnp.zeros_like(face)
+        modes = modes.astype(face.dtype)
         return jnp.tensordot(jnp.tensordot(modes, face, 3), modes, 1)
 
     def project(self, r: Nodal, held: Array) -> Nodal:
@@ -294,36 +296,46 @@ class Problem(eqx.Module):
         """
         u, mean_stress = x
         body, low_order = _single(self.body), _single(self.low_order or self.body)
-        K = low_order.cell_stiffness(_single(u), _single(mean_stress))
-        drag = _single(self._drag(self.viscosity)) * _LUMPED
-        K = K + drag
-        guarded = K
-        points = None
-        if self.low_order is not None:
-            points = body.point_tangent(_single(u))
-            K = jnp.broadcast_to(drag, K.shape)
+        drag = _single(self._drag(self.viscosity))
+        K = low_order.cell_stiffness(_single(u), _single(mean_stress), more=drag * _LUMPED)
+        points = None if self.low_order is None else body.point_tangent(_single(u))
         volume = None
         if mean_stress is not None:
             volume, stiffness = self._volume_coupling(body, _single(u))
-            guarded = guarded + stiffness
+            K = K + stiffness
         matrices = self.contacts.map(
             lambda body, face, history, law: face.stiffness_matrices(fraction, self._corners(u, body), history, law),
             state.histories,
             laws,
         )
+        faces = {}
         for name, both in zip(Bodies._fields, matrices, strict=True):
             if both is not None:
-                K = add_matrices(K, _single(both[0]), name)
-                guarded = add_matrices(guarded, _single(both[1]), name)
+                exact, guard = _single(both)
+                K = add_matrices(K, guard, name)
+                faces[name] = exact if points is not None else exact - guard
         scale = self.typical_stiffness
-        if self.spring is not None:
-            K = add_matrices(K, _single(self._foundation(jnp.sum(self.spring))), "window")
+        spring = jnp.zeros(()) if self.spring is None else jnp.sum(self.spring)
+        support = jnp.zeros(())
         if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
-            guarded = add_matrices(
-                guarded, _single(self._foundation(1e-3 * scale * self.positions[0, 0].size)), "window"
-            )
-        return assemble_tangent(K, guarded, self.free, scale, transposed, body.cells, points, volume)
+            support = 1e-3 * scale * self.positions[0, 0].size
+            K = add_matrices(K, _single(self._foundation(spring + support)), "window")
+        shape = u.shape[1:]
+        diagonal = -support * _window_share(shape)
+        if points is not None:
+            diagonal = spring * _window_share(shape) + drag * _node_share(shape)
+        free = self.free
+        tangent = Tangent(
+            multigrid=build_multigrid(K, None if free.all() else free, scale),
+            faces=Bodies(**faces),
+            diagonal=_single(diagonal),
+            free=None if free.all() else jnp.asarray(free, jnp.float32),
+            cells=body.cells,
+            points=points,
+            volume=volume,
+        )
+        return tangent.transposed() if transposed else tangent
 
     def _volume_coupling(self, body: LayerBody, u: Nodal) -> tuple[VolumeCoupling, Array]:
         """Couple mean stress and displacement; and the stiffness of volume for the preconditioner [N/mm]."""
@@ -402,13 +414,20 @@ class Problem(eqx.Module):
 # Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
 VOLUME_GUARD = 20.0
 # Every corner's share of its element, as an element matrix.
-_LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3))[..., None, None].astype(np.float32)
+_LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3)).astype(np.float32)
 
 
 def _node_share(shape: tuple[int, ...]) -> np.ndarray:
     """Compute how many elements' worth each node has: 1 inside, half on a face: `_LUMPED` assembled."""
     z, y, x = (np.where(np.isin(np.arange(n), (0, n - 1)), 0.5, 1.0) for n in shape)
     return z[:, None, None] * y[:, None] * x
+
+
+def _window_share(shape: tuple[int, ...]) -> np.ndarray:
+    """Compute how much of the window face each node has along x and y, `(3, *shape)`: of sum 1 in each."""
+    share = np.zeros((3, *shape))
+    share[:2, 0] = 2.0 * _node_share(shape)[0]
+    return share / ((shape[1] - 1) * (shape[2] - 1))
 
 
 def _single(tree: Any) -> Any:

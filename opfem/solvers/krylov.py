@@ -54,7 +54,7 @@ def fgmres(
     """
     like, b = b, _flat(b)
     n = b.size
-    target = rtol * _norm(b)
+    target = jnp.asarray(rtol, b.dtype) * _norm(b)
 
     def restart(carry):
         x, r, iterations, _ = carry
@@ -94,19 +94,21 @@ def _extend(s: _Basis, operator, preconditioner, like: PyTree) -> _Basis:
     j = s.j
     z = _flat(preconditioner(_unflat(s.V[j], like))).astype(jnp.float32)
     w = _flat(operator(_unflat(z, like))).astype(s.V.dtype)
-    h = s.V @ w
-    w = w - h @ s.V
-    again = s.V @ w  # classical Gram–Schmidt twice is as good as modified, and two matrix products
-    w = w - again @ s.V
+
+    def orthogonalise(k, carry):
+        w, h = carry
+        along = jnp.vdot(s.V[k], w)
+        return w - along * s.V[k], h.at[k].set(along)
+
+    w, h = jax.lax.fori_loop(0, j + 1, orthogonalise, (w, jnp.zeros_like(s.g)))
     size = _norm(w)
-    h = (h + again).at[j + 1].set(size)
 
     def rotate(k, h):
         c, sn = s.rotations[0, k], s.rotations[1, k]
         turned = jnp.stack([c * h[k] + sn * h[k + 1], -sn * h[k] + c * h[k + 1]])
-        return jnp.where(k < j, jax.lax.dynamic_update_slice(h, turned, (k,)), h)
+        return jax.lax.dynamic_update_slice(h, turned, (k,))
 
-    h = jax.lax.fori_loop(0, s.R.shape[0], rotate, h)
+    h = jax.lax.fori_loop(0, j, rotate, h.at[j + 1].set(size))
     radius = jnp.sqrt(h[j] ** 2 + h[j + 1] ** 2)
     radius = jnp.where(radius > 0, radius, 1.0)
     c, sn = h[j] / radius, h[j + 1] / radius

@@ -6,6 +6,7 @@ are Galerkin products of element matrices; everything is float32 inside float64 
 An odd count of elements is padded with an empty one, so any mesh coarsens.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..mechanics.staging import apart
 from .stencil import (
     ElementMatrices,
     Nodal,
@@ -20,30 +22,42 @@ from .stencil import (
     apply_stencil,
     assemble_stencil,
     column_blocks,
+    dense_matrix,
     held,
     with_unit_diagonal,
 )
 
-# Chebyshev smooths the part of the spectrum above the largest eigenvalue over this number.
-_SMOOTHED_RANGE = 8.0
-_SMOOTHER_STEPS = 2
-_POWER_STEPS = 8
+# The eigenvalues that the smoother damps. None is larger: an element touches four columns, so that
+# xᵀ K x ≤ 4 xᵀ D x for the part D of K within columns (element by element, by the triangle inequality).
+_SMOOTHED = (0.5, 4.0)
 # The coarsest grid is solved by one dense inverse of at most about this many unknowns.
-_DENSE_UNKNOWNS = 600
+_DENSE_UNKNOWNS = 300
+
+
+def _chebyshev(low: float, high: float) -> tuple[float, float, float]:
+    """Compute the factor of the first step's residual, and those of step and residual in the second step.
+
+    Source:
+        Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 12.1.
+    """
+    centre, half_width = 0.5 * (high + low), 0.5 * (high - low)
+    rho = half_width / centre
+    next_rho = 1.0 / (2.0 / rho - rho)
+    return 1.0 / centre, next_rho * rho, 2.0 * next_rho / half_width
 
 
 class Level(NamedTuple):
-    """One grid: its operator, column inverses, largest eigenvalue and free unknowns."""
+    """One grid: its operator, column inverses and free unknowns."""
 
     stencil: Stencil
     columns: Float[Array, "m m my mx"]
-    largest: Float[Array, ""]
     free: Nodal | None
 
 
 class Multigrid(NamedTuple):
-    """The levels, finest first, and the inverse of the coarsest operator."""
+    """The operator of the finest grid, the levels, finest first, and the inverse of the coarsest operator."""
 
+    finest: Stencil
     levels: tuple[Level, ...]
     coarsest: Float[Array, "n n"]
     coarsest_free: Nodal | None
@@ -63,14 +77,17 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
     while True:
         mask = None if free is None else jnp.asarray(free, jnp.float32)
         K = K if mask is None else held(K, mask)
-        S = with_unit_diagonal(assemble_stencil(K), scale)
+        S = assemble_stencil(K)
+        if free is not None or levels:  # a coarse grid may have ghosts
+            S = apart(with_unit_diagonal, S, scale)
+        if not levels:
+            finest = S
         nodes = S.shape[-3:]
         if 3 * int(np.prod(nodes)) <= _DENSE_UNKNOWNS or max(nodes[1:]) <= 3:
-            return Multigrid(tuple(levels), _dense_inverse(S), mask)
-        columns = _invert_columns(column_blocks(S))
-        levels.append(Level(S, columns, _largest_eigenvalue(S, columns), mask))
+            return Multigrid(finest, tuple(levels), jnp.linalg.inv(dense_matrix(S)), mask)
+        levels.append(Level(S, _invert_columns(column_blocks(S)), mask))
         for cell in _coarsened_axes(S.shape):
-            K = _coarsen(K, cell)
+            K = apart(partial(_coarsen, cell=cell), K)
         free = None if free is None else _coarsen_mask(free)
 
 
@@ -83,12 +100,27 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     if depth == len(multigrid.levels):
         return (multigrid.coarsest @ r.reshape(-1)).reshape(r.shape)
     level = multigrid.levels[depth]
-    x, r = _smooth(level, r)
-    coarse = _v_cycle(multigrid, depth + 1, _free(multigrid, depth + 1, _restrict(r)))
-    correction = _prolong(coarse, r.shape)
-    correction = correction if level.free is None else correction * level.free
-    r = r - apply_stencil(level.stencil, correction)
-    return x + correction + _smooth(level, r)[0]
+
+    def correction(r):
+        coarse = _v_cycle(multigrid, depth + 1, _free(multigrid, depth + 1, _restrict(r)))
+        fine = _prolong(coarse, r.shape)
+        return fine if level.free is None else fine * level.free
+
+    first, old, new = _chebyshev(*_SMOOTHED)
+    of_step, of_residual = jnp.array([old, 0.0, 0.0, old], r.dtype), jnp.array([new, 0.0, first, new], r.dtype)
+
+    def move(k, carry):
+        x, r, step = carry
+        x, r = x + step, r - apply_stencil(level.stencil, step)
+        next_step = jax.lax.cond(
+            k == 1, lambda: correction(r), lambda: of_step[k] * step + of_residual[k] * _solve_columns(level.columns, r)
+        )
+        return x, r, next_step
+
+    # Two steps of the smoother, the coarse correction and again two steps, of which the last is only added. One
+    # loop, so that its parts are compiled once.
+    x, _, step = jax.lax.fori_loop(0, 4, move, (jnp.zeros_like(r), r, first * _solve_columns(level.columns, r)))
+    return x + step
 
 
 def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
@@ -96,29 +128,14 @@ def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     return r if mask is None else r * mask
 
 
-def _smooth(level: Level, r: Nodal) -> tuple[Nodal, Nodal]:
-    """Reduce the residual by Chebyshev iteration over column solves; return change and residual."""
-    centre = 0.5 * level.largest * (1.0 + 1.0 / _SMOOTHED_RANGE)
-    half_width = 0.5 * level.largest * (1.0 - 1.0 / _SMOOTHED_RANGE)
-    sigma = centre / half_width
-    direction = _solve_columns(level.columns, r) / centre
-
-    def step(_, carry):
-        x, r, d, rho = carry
-        x, r = x + d, r - apply_stencil(level.stencil, d)
-        next_rho = 1.0 / (2.0 * sigma - rho)
-        d = next_rho * rho * d + (2.0 * next_rho / half_width) * _solve_columns(level.columns, r)
-        return x, r, d, next_rho
-
-    x, r, _, _ = jax.lax.fori_loop(0, _SMOOTHER_STEPS, step, (jnp.zeros_like(r), r, direction, 1.0 / sigma))
-    return x, r
-
-
 def _solve_columns(inverses: Array, r: Nodal) -> Nodal:
+    return apart(_times_columns, inverses, r)
+
+
+def _times_columns(inverses: Array, r: Nodal) -> Nodal:
     m = inverses.shape[0]
-    columns = jnp.moveaxis(r, 0, 1).reshape(m, *r.shape[2:])
-    x = jax.lax.fori_loop(0, m, lambda j, x: x + inverses[j] * columns[j], jnp.zeros_like(columns))
-    return jnp.moveaxis(x.reshape(m // 3, 3, *r.shape[2:]), 1, 0)
+    columns, rows = r.reshape(m, -1), inverses.reshape(m, m, -1)
+    return sum((rows[j] * columns[j] for j in range(1, m)), start=rows[0] * columns[0]).reshape(r.shape)
 
 
 def _invert_columns(blocks: Array) -> Array:
@@ -138,30 +155,6 @@ def _invert_columns(blocks: Array) -> Array:
         return jnp.where(is_k[:, None], row[None], B)
 
     return jax.lax.fori_loop(0, blocks.shape[0], eliminate, blocks)
-
-
-def _largest_eigenvalue(S: Stencil, columns: Array) -> Array:
-    """Estimate the largest eigenvalue of the column-preconditioned operator by power iteration."""
-    shape = (3, *S.shape[-3:])
-    # A fixed start that contains every frequency; the same bits in every run.
-    start = jnp.asarray(np.random.default_rng(0).standard_normal(shape), S.dtype)
-
-    def step(_, carry):
-        v, _ = carry
-        v = _solve_columns(columns, apply_stencil(S, v))
-        size = jnp.sqrt(jnp.vdot(v, v))
-        return v / size, size
-
-    _, largest = jax.lax.fori_loop(0, _POWER_STEPS, step, (start, jnp.ones((), S.dtype)))
-    return 1.1 * largest
-
-
-def _dense_inverse(S: Stencil) -> Array:
-    shape = (3, *S.shape[-3:])
-    size = int(np.prod(shape))
-    unit = jnp.eye(size, dtype=S.dtype).reshape(size, *shape)
-    dense = jax.vmap(lambda e: apply_stencil(S, e))(unit).reshape(size, size)
-    return jnp.linalg.inv(dense)
 
 
 def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:

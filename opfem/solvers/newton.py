@@ -18,7 +18,7 @@ from ..mechanics.face import FaceRule
 from .equilibrium import Forces, Problem, State
 from .krylov import KrylovResult, fgmres
 from .stencil import Nodal
-from .tangent import Tangent, Unknowns, preconditioner
+from .tangent import Tangent, Unknowns
 
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
@@ -182,22 +182,28 @@ def solve_increment(
 
 
 def solve_tangent(problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton) -> KrylovResult:
-    """Solve one linear system with the tangent, on free unknowns without the held rigid motions."""
-    precondition = preconditioner(tangent, problem.free, problem.typical_stiffness)
+    """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
+
+    In float32, like the tangent.
+    """
     scale = problem.stress_scale
+    b = b.scaled(scale)
+    size = jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(b)))
+    size = jnp.where(size > 0, size, 1.0)
 
     def inside(x: Unknowns) -> Unknowns:
         return x._replace(u=problem.project(x.u, held))
 
     result = fgmres(
-        lambda v: inside(tangent.apply(inside(v))),
-        lambda v: inside(precondition(v)),
-        b.scaled(scale),
+        lambda v: inside(tangent.apply(v)),
+        lambda v: inside(tangent.precondition(v)),
+        jax.tree.map(lambda part: (part / size).astype(jnp.float32), b),
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,
         max_iterations=settings.krylov_steps,
     )
-    return result._replace(x=result.x.scaled(scale))
+    x = jax.tree.map(lambda part: size * part, result.x)
+    return result._replace(x=x.scaled(scale))
 
 
 def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:

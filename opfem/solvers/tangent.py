@@ -7,13 +7,14 @@ Displacement alone, or displacement and the elements' mean stress: a saddle poin
 import itertools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
+from ..mechanics.boundary import Bodies, put, take, to_touching
 from ..mechanics.kinematics import LayerCells
-from .multigrid import apply_multigrid, build_multigrid
-from .stencil import ElementMatrices, Nodal, Stencil, apply_stencil, assemble_stencil, held, with_unit_diagonal
+from .multigrid import Multigrid, apply_multigrid
+from .stencil import Nodal, apply_stencil
 
 
 class Unknowns(NamedTuple):
@@ -66,71 +67,82 @@ class VolumeCoupling(NamedTuple):
 
 
 class Tangent(NamedTuple):
-    """The tangent in float32, and the element matrices its preconditioner is built from."""
+    """The linear operator of one Newton step, in float32, and its preconditioner.
 
-    stencil: Stencil
-    guarded: ElementMatrices
-    free: Nodal
+    The preconditioner is a V-cycle for a stiffness that is symmetric and positive where it matters, the guarded
+    one. Its finest stencil serves the operator too, which adds what the guarded stiffness lacks.
+
+    Attributes:
+        multigrid: Of the guarded stiffness.
+        faces: What it lacks of contact, or all contact where it lacks the body: face matrices `(4, 4, 3, 3, faces)`.
+        diagonal: What it lacks of springs and drag at the nodes [N/mm]; broadcasts to a nodal field.
+        free: 1 where an unknown is free; None where all are.
+        cells: Cells of the layer.
+        points: dP/dF times volume, where the stiffness is of other elements than the body.
+        volume: How mean stress and displacement couple, where mean stress is an unknown.
+    """
+
+    multigrid: Multigrid
+    faces: Bodies
+    diagonal: Array
+    free: Nodal | None
     cells: LayerCells
-    points: Array | None  # dP/dF times volume, where the body is not in the stencil
+    points: Array | None
     volume: VolumeCoupling | None
 
     def apply(self, x: Unknowns) -> Unknowns:
         """Multiply with unknowns."""
-        f = apply_stencil(self.stencil, x.u)
+        u = x.u.astype(jnp.float32)
+        inside = u if self.free is None else self.free * u
+        more = self._of_faces(inside) + self.diagonal * inside
         if self.points is not None:
-            H = self.cells.displacement_gradient((self.free * x.u).astype(jnp.float32))
-            stress = jnp.zeros_like(H)
-            for k, L in itertools.product(range(3), repeat=2):
-                stress = stress + self.points[:, :, k, L] * H[k, L]
-            f = f + self.free * self.cells.assemble(self.cells.nodal_vectors(stress))
+            more = more + self._of_points(self.points, inside)
+        if self.free is not None:
+            more = self.free * more
+        f = more if self.points is not None else apply_stencil(self.multigrid.finest, u) + more
         if self.volume is None or x.mean_stress is None:
             return Unknowns(f)
-        f = f + self.volume.force(self.cells, x.mean_stress)
-        change = self.volume.change(self.cells, x.u)
+        change = self.volume.change(self.cells, u)
+        guard = self.volume.guard / self.volume.mass * change
+        f = f + self.volume.force(self.cells, x.mean_stress - guard)
         return Unknowns(f, change - self.volume.compliance * self.volume.mass * x.mean_stress)
 
+    def precondition(self, r: Unknowns) -> Unknowns:
+        """Apply one V-cycle; with mean stress, a block-triangular step around it.
 
-def assemble_tangent(
-    K: ElementMatrices,
-    guarded: ElementMatrices,
-    free: np.ndarray,
-    scale: Array,
-    transposed: bool,
-    cells: LayerCells,
-    points: Array | None,
-    volume: VolumeCoupling | None,
-) -> Tangent:
-    """Assemble the tangent; rows of unknowns that are not free get `scale` [N/mm] on the diagonal."""
-    if not free.all():
-        K = held(K, jnp.asarray(free))
-    if transposed:
-        K = jnp.transpose(K, (0, 2, 1, 4, 3, 5, 6))
-        points = None if points is None else jnp.transpose(points, (2, 3, 0, 1, *range(4, points.ndim)))
-    S = assemble_stencil(K)
-    if points is None:
-        S = with_unit_diagonal(S, scale)
-    return Tangent(S, guarded, jnp.asarray(free, jnp.float32), cells, points, volume)
+        The displacement block carries the guard's stiffness of volume (an augmented Lagrangian), so that the
+        iterations do not grow with the bulk modulus.
 
-
-def preconditioner(tangent: Tangent, free: np.ndarray, scale: Array):
-    """Build the preconditioner: one V-cycle; with mean stress, a block-triangular step around it.
-
-    The displacement block carries the guard's stiffness of volume (an augmented Lagrangian), so that the
-    iterations do not grow with the bulk modulus.
-
-    Source:
-        Benzi, Golub & Liesen, Acta Numerica 14 (2005), sections 8 and 10.
-    """
-    multigrid = build_multigrid(tangent.guarded, None if free.all() else free, scale)
-    volume, cells = tangent.volume, tangent.cells
-
-    def apply(r: Unknowns) -> Unknowns:
-        if volume is None or r.mean_stress is None:
-            return Unknowns(apply_multigrid(multigrid, r.u))
+        Source:
+            Benzi, Golub & Liesen, Acta Numerica 14 (2005), sections 8 and 10.
+        """
+        if self.volume is None or r.mean_stress is None:
+            return Unknowns(apply_multigrid(self.multigrid, r.u))
         rest = r.mean_stress.astype(jnp.float32)
-        push = volume.force(cells, volume.guard / volume.mass * rest)
-        u = apply_multigrid(multigrid, r.u + push)
-        return Unknowns(u, volume.schur_inverse * (volume.change(cells, u) - rest))
+        push = self.volume.force(self.cells, self.volume.guard / self.volume.mass * rest)
+        u = apply_multigrid(self.multigrid, r.u + push)
+        return Unknowns(u, self.volume.schur_inverse * (self.volume.change(self.cells, u) - rest))
 
-    return apply
+    def transposed(self) -> "Tangent":
+        """Transpose the operator; the guarded stiffness is symmetric."""
+        faces = jax.tree.map(lambda K: jnp.transpose(K, (1, 0, 3, 2, 4)), self.faces)
+        points = self.points
+        points = None if points is None else jnp.transpose(points, (2, 3, 0, 1, *range(4, points.ndim)))
+        return self._replace(faces=faces, points=points)
+
+    def _of_faces(self, u: Nodal) -> Nodal:
+        _, nz, ny, nx = (n - 1 for n in u.shape)
+        f = jnp.zeros_like(u)
+        for body, K in zip(Bodies._fields, self.faces, strict=True):
+            if K is not None:
+                corners = take(u, body, with_sides=K.shape[-1] > ny * nx)
+                forces = jnp.sum(K * corners[None, :, None], axis=(1, 3))
+                f = f + put(to_touching(forces, (nz, ny, nx)), body, u.shape)
+        return f
+
+    def _of_points(self, points: Array, u: Nodal) -> Nodal:
+        H = self.cells.displacement_gradient(u)
+        stress = jnp.zeros_like(H)
+        for k, L in itertools.product(range(3), repeat=2):
+            stress = stress + points[:, :, k, L] * H[k, L]
+        return self.cells.assemble(self.cells.nodal_vectors(stress))

@@ -10,7 +10,7 @@ import opfem as op
 from opfem.mechanics.internal import layer_body
 from opfem.mechanics.unstructured import unstructured_cells
 from opfem.model import LayerMesh
-from opfem.model.deformation import kinematics, outer
+from opfem.model.deformation import ProductSum, kinematics
 from tests.oracles import warped_thickness
 from tests.tolerances import ROUNDOFF
 from tests.verification import meshes
@@ -46,8 +46,9 @@ def force_and_volume(cells, u):
 
 def stiffness(cells, u):
     k = kinematics(cells.displacement_gradient(u))
-    A = MATERIAL.tangent(k, MATERIAL.volumetric_stress(k.volume_change)) + (MATERIAL.bulk * k.J**2) * outer(k.G, k.G)
-    return cells.matrices(A * cells.weight)
+    volumetric = ProductSum(direct=((MATERIAL.bulk * k.J**2, k.G, k.G),))
+    A = MATERIAL.tangent(k, MATERIAL.volumetric_stress(k.volume_change)) + volumetric
+    return cells.matrices(A.scaled(cells.weight))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -128,7 +128,7 @@ def test_column_inverses_equal_numpy():
     dense = free.ravel()[:, None] * assemble_dense(K) * free.ravel() + 1e-3 * np.diag(1 - free.ravel())
     for y in range(ny + 1):
         for x in range(nx + 1):
-            places = [nodal_index((nz + 1, ny + 1, nx + 1), c, z, y, x) for z in range(nz + 1) for c in range(3)]
+            places = [nodal_index((nz + 1, ny + 1, nx + 1), c, z, y, x) for c in range(3) for z in range(nz + 1)]
             expected = np.linalg.inv(dense[np.ix_(places, places)])
             np.testing.assert_allclose(inverses[:, :, y, x], expected, atol=10 * ROUNDOFF * np.abs(expected).max())
 
@@ -145,6 +145,17 @@ def layer_stiffness(elements, extent=(5.0, 4.0), thickness=0.5):
 
 
 _stiffness_at_rest = eqx.filter_jit(lambda body, u: body.cell_stiffness(u))
+
+
+@pytest.mark.parametrize("elements", [(6, 4, 2), (3, 2, 5)])
+def test_columns_bound_the_spectrum(elements):
+    """An element touches four columns: no eigenvalue is above 4, what the smoother is built for."""
+    K, shape = layer_stiffness(elements), node_shape(elements)
+    free = bottom_and_side_held(elements).ravel() == 1
+    column = np.broadcast_to(np.arange(shape[1] * shape[2]).reshape(shape[1:]), (3, *shape)).ravel()[free]
+    dense = assemble_dense(K)[np.ix_(free, free)]
+    within = np.where(column[:, None] == column, dense, 0.0)
+    assert 2.0 < np.linalg.eigvals(np.linalg.solve(within, dense)).real.max() < 4.0
 
 
 def rollers(elements, bonded):

@@ -89,7 +89,7 @@ def test_unit_diagonal_is_put_only_where_a_row_is_empty(K, free):
 def test_column_blocks_are_the_columns_of_the_dense_matrix(K, S):
     dense, blocks = assemble_dense(K), np.asarray(column_blocks(S))
     for y, x in itertools.product(range(NY + 1), range(NX + 1)):
-        places = [nodal_index(SHAPE, c, z, y, x) for z in range(NZ + 1) for c in range(3)]
+        places = [nodal_index(SHAPE, c, z, y, x) for c in range(3) for z in range(NZ + 1)]
         np.testing.assert_allclose(blocks[:, :, y, x], dense[np.ix_(places, places)], ROUNDOFF, 10 * ROUNDOFF)
 
 
