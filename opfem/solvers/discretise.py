@@ -25,7 +25,8 @@ from ..model import (
     Traction,
     height_field,
 )
-from .equilibrium import VOLUME_GUARD, Problem, Supports
+from .equilibrium import Problem, Supports
+from .tangent import VOLUME_GUARD
 
 
 def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceRule) -> Problem:

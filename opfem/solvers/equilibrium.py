@@ -18,7 +18,7 @@ from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
 from .multigrid import build_multigrid
 from .stencil import Nodal
-from .tangent import Tangent, Unknowns, VolumeCoupling
+from .tangent import Tangent, Unknowns, couple_volume
 
 
 class Supports(NamedTuple):
@@ -301,7 +301,7 @@ class Problem(eqx.Module):
         points = None if self.low_order is None else body.point_tangent(_single(u))
         volume = None
         if mean_stress is not None:
-            volume, stiffness = self._volume_coupling(body, _single(u))
+            volume, stiffness = couple_volume(body, self.free, _single(u), _single(self.stress_scale))
             K = K + stiffness
         matrices = self.contacts.map(
             lambda body, face, history, law: face.stiffness_matrices(fraction, self._corners(u, body), history, law),
@@ -336,24 +336,6 @@ class Problem(eqx.Module):
             volume=volume,
         )
         return tangent.transposed() if transposed else tangent
-
-    def _volume_coupling(self, body: LayerBody, u: Nodal) -> tuple[VolumeCoupling, Array]:
-        """Couple mean stress and displacement; and the stiffness of volume for the preconditioner [N/mm]."""
-        by_node = body.volume_vectors(u)
-        volume = body.cells.volume[0]
-        guard = VOLUME_GUARD * body.material.shear
-        vectors = jnp.moveaxis(by_node, 2, 0)  # layers first
-        pairs = vectors[:, :, None, :, None] * vectors[:, None, :, None, :]
-        stiffness = (guard / volume)[:, None, None, None, None] * pairs
-        scale = _single(self.stress_scale)
-        coupling = VolumeCoupling(
-            vectors=scale * by_node * body.cells.gather(jnp.asarray(self.free, by_node.dtype)),
-            mass=scale**2 * volume,
-            compliance=1.0 / body.material.bulk,
-            guard=guard,
-            shear=body.material.shear,
-        )
-        return coupling, stiffness
 
     def _drag(self, viscosity: Array) -> Array:
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
@@ -411,8 +393,6 @@ class Problem(eqx.Module):
         return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
 
 
-# Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
-VOLUME_GUARD = 20.0
 # Every corner's share of its element, as an element matrix.
 _LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3)).astype(np.float32)
 

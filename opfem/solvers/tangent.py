@@ -9,12 +9,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.boundary import Bodies, put, take, to_touching
+from ..mechanics.internal import LayerBody
 from ..mechanics.kinematics import LayerCells
 from .multigrid import Multigrid, apply_multigrid
 from .stencil import Nodal, apply_stencil
+
+
+# Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
+VOLUME_GUARD = 20.0
 
 
 class Unknowns(NamedTuple):
@@ -64,6 +70,33 @@ class VolumeCoupling(NamedTuple):
         """Invert what is left for the mean stress when displacement with the guard's stiffness is eliminated."""
         left = 1.0 - self.guard * self.compliance
         return 1.0 / (self.mass * (self.compliance + left / (self.guard + 2.0 * self.shear)))
+
+
+def couple_volume(
+    body: LayerBody, free: np.ndarray, u: Nodal, scale: Array
+) -> tuple[VolumeCoupling, Float[Array, "nz 8 8 3 3 ny nx"]]:
+    """Couple mean stress and displacement; and the stiffness of volume for the preconditioner [N/mm].
+
+    Args:
+        body: The layer.
+        free: Mask of the unknowns, 1 where free.
+        u: Displacement [mm].
+        scale: Mean stress that weighs as much as a displacement of 1 mm [MPa/mm].
+    """
+    by_node = body.volume_vectors(u)
+    volume = body.cells.volume[0]
+    guard = VOLUME_GUARD * body.material.shear
+    vectors = jnp.moveaxis(by_node, 2, 0)  # layers first
+    pairs = vectors[:, :, None, :, None] * vectors[:, None, :, None, :]
+    stiffness = (guard / volume)[:, None, None, None, None] * pairs
+    coupling = VolumeCoupling(
+        vectors=scale * by_node * body.cells.gather(jnp.asarray(free, by_node.dtype)),
+        mass=scale**2 * volume,
+        compliance=1.0 / body.material.bulk,
+        guard=guard,
+        shear=body.material.shear,
+    )
+    return coupling, stiffness
 
 
 class Tangent(NamedTuple):
