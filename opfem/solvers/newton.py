@@ -133,7 +133,7 @@ def solve_increment(
         return size < _SETTLED / settings.rtol * tolerance
 
     def step(it):
-        settled = is_settled(it.size, it.tolerance) | (it.steps == 0)
+        settled = is_settled(it.size, it.tolerance)
         u = it.x.u
         laws = problem.tangent_laws(u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
         r = problem.residual(problem.with_contact(it.forces, u, fraction, state, laws), held)

@@ -18,7 +18,6 @@ from ..mechanics.kinematics import LayerCells
 from .multigrid import Multigrid, apply_multigrid
 from .stencil import Nodal, apply_stencil
 
-
 # Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
 VOLUME_GUARD = 20.0
 
