@@ -95,8 +95,11 @@ def main() -> None:
     parser.add_argument("--sample-friction", type=float, default=0.05)
     parser.add_argument("--smooth", type=float, default=0.06, help="FWHM [mm]")
     parser.add_argument("--again", action="store_true", help="solve each case a second time with another c10")
+    parser.add_argument("--cache", type=Path, help="keep what is compiled in this folder, and use it")
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if chosen.cache is not None:
+        op.cache_compilation(chosen.cache)
     thickness = op.read_thickness(chosen.map, extent=(5.0, 5.0)).smoothed(fwhm=chosen.smooth)
     for n in chosen.elements:
         for interpolation in chosen.interpolation:

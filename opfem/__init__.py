@@ -7,6 +7,7 @@ pressure is positive in compression.
 from typing import Any
 
 from . import datasets as datasets
+from .compilation import cache_compilation as cache_compilation
 from .io import (
     read_netcdf as read_netcdf,
     read_thickness as read_thickness,

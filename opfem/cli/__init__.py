@@ -22,6 +22,7 @@ from cyclopts import App, Parameter
 from rich.console import Console
 from rich.table import Table
 
+from ..compilation import cache_compilation
 from ..datasets import COIN_LAYER, coin_file
 from ..io import read_thickness, whole_file, write_netcdf, write_thickness, write_vtu
 from ..measurement import EXAMPLE_LAYER, ThicknessMap, example_map
@@ -92,6 +93,8 @@ def palpate(
     """
     with _reporting(run.debug):
         jax.config.update("jax_enable_x64", True)
+        if run.keep_compiled:
+            cache_compilation()
         _refuse_finished(out, run.force)
         measured, unloaded = read_maps(map, reading)
         palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
