@@ -16,7 +16,7 @@ _WORTH_KEEPING = 0.1
 def cache_compilation(folder: str | os.PathLike | None = None) -> Path:
     """Keep what is compiled on disk, for all processes to come: call it once in each, before the first solve.
 
-    The first solve of a process then takes little more than its run time, where one of the same mesh, element,
+    The first solve of a process then only traces, a few seconds, and runs, where one of the same mesh, element,
     contact and JAX was solved before on this machine. Each takes some 2 MB; JAX removes none.
 
     Args:

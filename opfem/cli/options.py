@@ -84,6 +84,6 @@ class RunOptions:
     increments: Annotated[int | None, Parameter(help="Load increments. Default: the solver's own.")] = None
     force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
     keep_compiled: Annotated[
-        bool, Parameter(help="Keep what is compiled on disk: later runs of the same mesh start at once.")
+        bool, Parameter(help="Keep what is compiled on disk: later runs of the same mesh need not compile.")
     ] = False
     debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False
