@@ -51,10 +51,16 @@ class ContactIterate(NamedTuple):
         pressure: Contact pressure at the points [MPa], an unknown of its own.
         direction: Slip that a sliding point had in the last step `(2, points, *faces)` [mm], zero
             where it stuck.
+        change: What the step found, but not yet taken, changes the pressure by [MPa].
     """
 
     pressure: Float[Array, "points *faces"]
     direction: Float[Array, "2 points *faces"]
+    change: Float[Array, "points *faces"]
+
+    def after(self, length: Array) -> "ContactIterate":
+        """Take a step of a length from 0 to 1."""
+        return self._replace(pressure=jnp.maximum(self.pressure + length * self.change, 0.0))
 
 
 class TangentLaw(NamedTuple):
@@ -227,7 +233,7 @@ class ContactFace(eqx.Module):
 
     def initial_iterate(self, history: SlipHistory) -> ContactIterate:
         """Start from the pressure of the last increment, as if every point had stuck."""
-        return ContactIterate(history.pressure, jnp.zeros_like(history.elastic))
+        return ContactIterate(history.pressure, jnp.zeros_like(history.elastic), jnp.zeros_like(history.pressure))
 
     def tangent_law(
         self, fraction: Array, x: Corners, history: SlipHistory, iterate: ContactIterate, curvature: Array
@@ -252,9 +258,9 @@ class ContactFace(eqx.Module):
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
 
     def follow(
-        self, fraction: Array, x: Corners, change: Corners, history: SlipHistory, law: TangentLaw, length: Array
+        self, fraction: Array, x: Corners, change: Corners, history: SlipHistory, law: TangentLaw
     ) -> ContactIterate:
-        """Compute what the next iteration remembers after a step of `length` along `change`.
+        """Compute what the next iteration remembers once a part of the step `change` is taken (`after`).
 
         The pressure follows the clearance's linear change.
         """
@@ -263,9 +269,10 @@ class ContactFace(eqx.Module):
             return self.at_points(fraction, surface_tangents(corners, self.rule)[0], history).clearance
 
         now, slope = jax.jvp(clearance, (x,), (change,))
-        pressure = jnp.maximum(law.pressure + length * (law(now + slope) - law.pressure), 0.0)
         point = self.at_points(fraction, surface_tangents(x, self.rule)[0], history, law)
-        return ContactIterate(pressure, jnp.where(point.sliding, point.elastic, 0.0))
+        return ContactIterate(
+            law.pressure, jnp.where(point.sliding, point.elastic, 0.0), law(now + slope) - law.pressure
+        )
 
     def _friction(self, pressure, position, history, slope_x, slope_y, sticks) -> "_Friction":
         trial = history.elastic + position[:2] - history.position

@@ -155,11 +155,11 @@ class Problem(eqx.Module):
             iterates,
         )
 
-    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Bodies, length: Array) -> Bodies:
-        """Compute what the next iteration remembers (`ContactIterate`) after a step of `length` along `change`."""
+    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Bodies) -> Bodies:
+        """Compute what the next iteration remembers (`ContactIterate`) once a part of the step `change` is taken."""
         return self.contacts.map(
             lambda body, face, history, law: face.follow(
-                fraction, self._corners(u, body), self._take(change, body), history, law, length
+                fraction, self._corners(u, body), self._take(change, body), history, law
             ),
             state.histories,
             laws,

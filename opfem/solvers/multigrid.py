@@ -3,6 +3,7 @@
 x and y are coarsened, z never: each column is solved exactly inside a Chebyshev smoother, which
 carries the strong coupling through the thickness and the contact stiffness. Coarse operators
 are Galerkin products of element matrices; everything is float32 inside float64 iterations.
+Interpolation to the finest grid lets heights follow lateral motion along a tilted contact (`_lean`).
 An odd count of elements is padded with an empty one, so any mesh coarsens.
 """
 
@@ -14,10 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..mechanics.hex8 import gather
 from ..mechanics.staging import apart
 from .stencil import (
     ElementMatrices,
     Nodal,
+    PartNodal,
     Stencil,
     apply_stencil,
     assemble_stencil,
@@ -30,20 +33,30 @@ from .stencil import (
 # The eigenvalues that the smoother damps. None is larger: an element touches four columns, so that
 # xᵀ K x ≤ 4 xᵀ D x for the part D of K within columns (element by element, by the triangle inequality).
 _SMOOTHED = (0.5, 4.0)
+# Steps of the smoother before the coarse correction, and as many after it.
+_SMOOTHING_STEPS = 2
+# Steps that heights take to follow lateral motion.
+_LEANING_STEPS = 4
 # The coarsest grid is solved by one dense inverse of at most about this many unknowns.
 _DENSE_UNKNOWNS = 300
 
 
-def _chebyshev(low: float, high: float) -> tuple[float, float, float]:
-    """Compute the factor of the first step's residual, and those of step and residual in the second step.
+def _chebyshev(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the factors of the last step and of the preconditioned residual in every step.
 
     Source:
         Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 12.1.
     """
+    low, high = _SMOOTHED
     centre, half_width = 0.5 * (high + low), 0.5 * (high - low)
     rho = half_width / centre
-    next_rho = 1.0 / (2.0 / rho - rho)
-    return 1.0 / centre, next_rho * rho, 2.0 * next_rho / half_width
+    of_step, of_residual = [0.0], [1.0 / centre]
+    for _ in range(steps - 1):
+        next_rho = 1.0 / (2.0 * centre / half_width - rho)
+        of_step.append(next_rho * rho)
+        of_residual.append(2.0 * next_rho / half_width)
+        rho = next_rho
+    return np.array(of_step), np.array(of_residual)
 
 
 class Level(NamedTuple):
@@ -55,9 +68,14 @@ class Level(NamedTuple):
 
 
 class Multigrid(NamedTuple):
-    """The operator of the finest grid, the levels, finest first, and the inverse of the coarsest operator."""
+    """The operator of the finest grid, the levels, finest first, and the inverse of the coarsest operator.
+
+    `lean` is how far a node of the finest grid moves along z when its surroundings move by 1 along x, and y;
+    zeros where nothing is coarsened.
+    """
 
     finest: Stencil
+    lean: Float[Array, "2 mz my mx"]
     levels: tuple[Level, ...]
     coarsest: Float[Array, "n n"]
     coarsest_free: Nodal | None
@@ -80,12 +98,15 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
         S = assemble_stencil(K)
         if free is not None or levels:  # a coarse grid may have ghosts
             S = apart(with_unit_diagonal, S, scale)
-        if not levels:
-            finest = S
         nodes = S.shape[-3:]
+        if not levels:
+            finest, lean = S, jnp.zeros((2, *nodes), S.dtype)
         if 3 * int(np.prod(nodes)) <= _DENSE_UNKNOWNS or max(nodes[1:]) <= 3:
-            return Multigrid(finest, tuple(levels), jnp.linalg.inv(dense_matrix(S)), mask)
+            return Multigrid(finest, lean, tuple(levels), _invert(dense_matrix(S), int(np.prod(nodes[1:]))), mask)
         levels.append(Level(S, _invert_columns(column_blocks(S)), mask))
+        if len(levels) == 1:
+            lean = _lean(S) if mask is None else mask[:2] * _lean(S)
+            K = apart(_leaning, K, lean)
         for cell in _coarsened_axes(S.shape):
             K = apart(partial(_coarsen, cell=cell), K)
         free = None if free is None else _coarsen_mask(free)
@@ -102,25 +123,62 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     level = multigrid.levels[depth]
 
     def correction(r):
+        if depth == 0:
+            r = jnp.concatenate([r[:2] + multigrid.lean * r[2], r[2:]])
         coarse = _v_cycle(multigrid, depth + 1, _free(multigrid, depth + 1, _restrict(r)))
         fine = _prolong(coarse, r.shape)
+        if depth == 0:
+            fine = jnp.concatenate([fine[:2], fine[2:] + jnp.sum(multigrid.lean * fine[:2], axis=0, keepdims=True)])
         return fine if level.free is None else fine * level.free
 
-    first, old, new = _chebyshev(*_SMOOTHED)
-    of_step, of_residual = jnp.array([old, 0.0, 0.0, old], r.dtype), jnp.array([new, 0.0, first, new], r.dtype)
+    half, factors = _SMOOTHING_STEPS, _chebyshev(_SMOOTHING_STEPS)
+    of_step, of_residual = (jnp.asarray(np.concatenate([f[1:], [0.0], f]), r.dtype) for f in factors)
 
     def move(k, carry):
         x, r, step = carry
         x, r = x + step, r - apply_stencil(level.stencil, step)
         next_step = jax.lax.cond(
-            k == 1, lambda: correction(r), lambda: of_step[k] * step + of_residual[k] * _solve_columns(level.columns, r)
+            k == half - 1,
+            lambda: correction(r),
+            lambda: of_step[k] * step + of_residual[k] * _solve_columns(level.columns, r),
         )
         return x, r, next_step
 
-    # Two steps of the smoother, the coarse correction and again two steps, of which the last is only added. One
-    # loop, so that its parts are compiled once.
-    x, _, step = jax.lax.fori_loop(0, 4, move, (jnp.zeros_like(r), r, first * _solve_columns(level.columns, r)))
+    # Steps of the smoother, the coarse correction and again steps of the smoother, of which the last is only added.
+    # One loop, so that its parts are compiled once.
+    start = (jnp.zeros_like(r), r, of_residual[half] * _solve_columns(level.columns, r))
+    x, _, step = jax.lax.fori_loop(0, 2 * half, move, start)
     return x + step
+
+
+def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
+    """Compute how far nodes move along z, at the least energy, where all of them move by 1 along x, and along y.
+
+    A layer that slides along an uneven sample rises and falls with it. Interpolated motion that does not would
+    press on the stiff contact: coarse grids would take for stiff what is soft.
+    """
+    zz = S[:, :, 2:, 2:]
+    columns = _invert_columns(column_blocks(zz))
+    of_step, of_residual = (jnp.asarray(factors, S.dtype) for factors in _chebyshev(_LEANING_STEPS))
+
+    def settle(push):
+        def move(k, carry):
+            z, r, step = carry
+            step = of_step[k] * step + of_residual[k] * _solve_columns(columns, r)
+            return z + step, r - apply_stencil(zz, step), step
+
+        none = jnp.zeros_like(push)
+        return jax.lax.fori_loop(0, _LEANING_STEPS, move, (none, push, none))[0]
+
+    push = sum(-S[dz, d, 2, :2] for dz in range(3) for d in range(9))
+    return jax.vmap(settle)(push[:, None])[:, 0]
+
+
+def _leaning(K: ElementMatrices, lean: Float[Array, "2 mz my mx"]) -> ElementMatrices:
+    """Turn the third component into what a node's height exceeds the lean by."""
+    a = jnp.moveaxis(gather(lean), 2, 0)  # nz, corners, x or y, ny, nx
+    K = jnp.concatenate([K[:, :, :, :2] + a[:, :, None, :, None] * K[:, :, :, 2:], K[:, :, :, 2:]], axis=3)
+    return jnp.concatenate([K[..., :2, :, :] + a[:, None, :, None] * K[..., 2:, :, :], K[..., 2:, :, :]], axis=4)
 
 
 def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
@@ -128,11 +186,11 @@ def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     return r if mask is None else r * mask
 
 
-def _solve_columns(inverses: Array, r: Nodal) -> Nodal:
+def _solve_columns(inverses: Array, r: PartNodal) -> PartNodal:
     return apart(_times_columns, inverses, r)
 
 
-def _times_columns(inverses: Array, r: Nodal) -> Nodal:
+def _times_columns(inverses: Array, r: PartNodal) -> PartNodal:
     m = inverses.shape[0]
     columns, rows = r.reshape(m, -1), inverses.reshape(m, m, -1)
     return sum((rows[j] * columns[j] for j in range(1, m)), start=rows[0] * columns[0]).reshape(r.shape)
@@ -155,6 +213,26 @@ def _invert_columns(blocks: Array) -> Array:
         return jnp.where(is_k[:, None], row[None], B)
 
     return jax.lax.fori_loop(0, blocks.shape[0], eliminate, blocks)
+
+
+def _invert(A: Float[Array, "n n"], m: int) -> Float[Array, "n n"]:
+    """Invert a symmetric positive matrix by Gauss–Jordan elimination of m unknowns at once; m divides n.
+
+    On two cores LAPACK takes up to five times longer here, its threads waiting for those of XLA.
+    """
+    n = A.shape[0]
+
+    def eliminate(k, B):
+        at = k * m
+        rows, columns = jax.lax.dynamic_slice(B, (at, 0), (m, n)), jax.lax.dynamic_slice(B, (0, at), (n, m))
+        pivot = jax.lax.dynamic_slice(rows, (0, at), (m, m))
+        pivot = _invert_columns(pivot[..., None, None])[..., 0, 0]
+        rows = pivot @ jax.lax.dynamic_update_slice(rows, jnp.eye(m, dtype=B.dtype), (0, at))
+        columns = jax.lax.dynamic_update_slice(columns, jnp.zeros((m, m), B.dtype), (at, 0))
+        B = jax.lax.dynamic_update_slice(B, jnp.zeros((n, m), B.dtype), (0, at)) - columns @ rows
+        return jax.lax.dynamic_update_slice(B, rows, (at, 0))
+
+    return jax.lax.fori_loop(0, n // m, eliminate, A)
 
 
 def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:

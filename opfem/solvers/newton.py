@@ -103,21 +103,29 @@ class IncrementResult(NamedTuple):
 
 
 class _Iterate(NamedTuple):
+    """Where an iteration is: `x + length × direction` is looked at next, its length at most 1."""
+
     x: Unknowns
+    direction: Unknowns
     contact: Bodies  # of ContactIterate
-    forces: Forces
+    forces: Forces  # at x, as size and tolerance
     size: Array
     tolerance: Array
     steps: Array
     krylov: Array
     unsolved: Array  # linear solves that ended at krylov_steps
     unsettled: Array  # steps in a row that ended far from equilibrium
+    finished: Array
 
 
 def solve_increment(
     problem: Problem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
 ) -> IncrementResult:
-    """Find equilibrium at a load fraction, from a converged state and a first guess."""
+    """Find equilibrium at a load fraction, from a converged state and a first guess.
+
+    One pass of the loop takes the step that the pass before found, and finds the next: in this order the residual
+    appears, and is compiled, once.
+    """
 
     def evaluate(x):
         forces = problem.forces(x, fraction, state)
@@ -125,25 +133,12 @@ def solve_increment(
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
         return forces, size, settings.rtol * problem.force_scale(forces)
 
-    def unfinished(it):
-        hopeless = (it.unsolved >= _MOST_UNSOLVED) | (it.unsettled >= _MOST_UNSETTLED)
-        return (it.size > it.tolerance) & (it.steps < settings.max_steps) & jnp.isfinite(it.size) & ~hopeless
-
     def is_settled(size, tolerance):
         return size < _SETTLED / settings.rtol * tolerance
 
-    def step(it):
-        settled = is_settled(it.size, it.tolerance)
-        u = it.x.u
-        laws = problem.tangent_laws(u, fraction, state, it.contact, jnp.where(settled, 1.0, 0.0))
-        r = problem.residual(problem.with_contact(it.forces, u, fraction, state, laws), held)
-        tangent = problem.tangent(it.x, fraction, state, laws)
-        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
-        change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
-        direction = solution.x._replace(u=change)
-
+    def take_step(it):
         def moved(length):
-            return jax.tree.map(lambda v, d: v + length * d, it.x, direction)
+            return jax.tree.map(lambda v, d: v + length * d, it.x, it.direction)
 
         def shorten(carry):
             length, count, *_ = carry
@@ -155,22 +150,54 @@ def solve_increment(
 
         start = (jnp.ones_like(it.size), 0, it.forces, jnp.full_like(it.size, jnp.inf), it.tolerance)
         length, _, forces, size, tolerance = jax.lax.while_loop(unusable, shorten, start)
-        return _Iterate(
+        unsettled = jnp.where(is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
+        hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
+        return it._replace(
             x=moved(length),
-            contact=problem.follow(u, change, fraction, state, laws, length),
+            contact=it.contact.map(lambda _, contact: contact.after(length)),
             forces=forces,
             size=size,
             tolerance=tolerance,
+            unsettled=unsettled,
+            finished=(size <= tolerance) | (it.steps >= settings.max_steps) | hopeless,
+        )
+
+    def find_step(it):
+        u = it.x.u
+        curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
+        laws = problem.tangent_laws(u, fraction, state, it.contact, curvature)
+        r = problem.residual(problem.with_contact(it.forces, u, fraction, state, laws), held)
+        tangent = problem.tangent(it.x, fraction, state, laws)
+        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
+        change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
+        return it._replace(
+            direction=solution.x._replace(u=change),
+            contact=problem.follow(u, change, fraction, state, laws),
             steps=it.steps + 1,
             krylov=it.krylov + solution.iterations,
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),
-            unsettled=jnp.where(is_settled(size, tolerance), 0, it.unsettled + 1),
         )
 
+    def step(it):
+        it = take_step(it)
+        return jax.lax.cond(it.finished, lambda it: it, find_step, it)
+
     x = guess._replace(u=problem.with_imposed(guess.u, fraction))
-    zero = jnp.zeros((), int)
-    first = _Iterate(x, problem.initial_iterates(state), *evaluate(x), zero, zero, zero, zero)
-    end = jax.lax.while_loop(unfinished, step, first)
+    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, x.u.dtype)
+    first = _Iterate(
+        x=x,
+        direction=jax.tree.map(jnp.zeros_like, x),
+        contact=problem.initial_iterates(state),
+        forces=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(evaluate, x)[0]),
+        size=far,
+        tolerance=far,
+        steps=zero,
+        krylov=zero,
+        unsolved=zero,
+        unsettled=zero,
+        finished=jnp.asarray(False),
+    )
+    end = jax.lax.while_loop(lambda it: ~it.finished, step, first)
     return IncrementResult(
         state=problem.advance(end.x, fraction, state, held, end.forces),
         converged=end.size <= end.tolerance,

@@ -18,6 +18,9 @@ from ..mechanics.staging import apart
 Stencil = Float[Array, "3 9 3 3 mz my mx"]
 ElementMatrices = Float[Array, "nz 8 8 3 3 ny nx"]
 Nodal = Float[Array, "3 mz my mx"]
+# A stencil of one, two or three of the components, and a field that it multiplies.
+PartStencil = Float[Array, "3 9 c c mz my mx"]
+PartNodal = Float[Array, "c mz my mx"]
 
 
 def assemble_stencil(K: ElementMatrices) -> Stencil:
@@ -49,7 +52,7 @@ def overlap(K: Array, a: int, b: int, cell: int) -> Array:
     )
 
 
-def apply_stencil(S: Stencil, u: Nodal) -> Nodal:
+def apply_stencil(S: PartStencil, u: PartNodal) -> PartNodal:
     """Multiply the assembled matrix with a nodal field.
 
     Along one axis of all nodes a neighbour is a shift, whatever the direction, and loops are long. What a shift
@@ -58,17 +61,18 @@ def apply_stencil(S: Stencil, u: Nodal) -> Nodal:
     return apart(_product, S, u)
 
 
-def _product(S: Stencil, u: Nodal) -> Nodal:
+def _product(S: PartStencil, u: PartNodal) -> PartNodal:
     shape = u.shape[1:]
     along_z, along_y, nodes = shape[1] * shape[2], shape[2], int(np.prod(shape))
     furthest = along_z + along_y + 1
-    padded = jnp.pad(u.reshape(3, nodes), ((0, 0), (furthest, furthest)))
-    blocks = S.reshape(27, 3, 3, nodes)
-    rows = [jnp.zeros(nodes, jnp.result_type(S, u))] * 3
+    components = len(u)
+    padded = jnp.pad(u.reshape(components, nodes), ((0, 0), (furthest, furthest)))
+    blocks = S.reshape(27, components, components, nodes)
+    rows = [jnp.zeros(nodes, jnp.result_type(S, u))] * components
     for block, (dz, dy, dx) in zip(blocks, itertools.product(range(3), repeat=3), strict=True):
         shift = dz * along_z + dy * along_y + dx
         neighbour = jax.lax.slice_in_dim(padded, shift, shift + nodes, axis=1)
-        for i, j in itertools.product(range(3), repeat=2):
+        for i, j in itertools.product(range(components), repeat=2):
             rows[i] = rows[i] + block[i, j] * neighbour[j]
     return jnp.stack(rows).reshape(u.shape)
 
@@ -90,14 +94,14 @@ def held(K: ElementMatrices, free: Nodal) -> ElementMatrices:
     return K * mask[:, :, None, :, None] * mask[:, None, :, None, :]
 
 
-def column_blocks(S: Stencil) -> Float[Array, "m m my mx"]:
-    """Collect each column's own matrix, m = 3 (nz+1) unknowns ordered as a nodal field's, (component, z)."""
-    nodes = S.shape[4]
-    blocks = jnp.zeros((3, nodes, 3, nodes, *S.shape[5:]), S.dtype)
+def column_blocks(S: PartStencil) -> Float[Array, "m m my mx"]:
+    """Collect each column's own matrix, m = c (nz+1) unknowns ordered as a nodal field's, (component, z)."""
+    components, nodes = S.shape[3:5]
+    blocks = jnp.zeros((components, nodes, components, nodes, *S.shape[5:]), S.dtype)
     for dz in range(3):
         places = jnp.eye(nodes, k=dz - 1, dtype=S.dtype)[None, :, None, :, None, None]
         blocks = blocks + places * jnp.swapaxes(S[dz, 4], 1, 2)[:, :, :, None]  # i, z, j, y, x
-    return blocks.reshape(3 * nodes, 3 * nodes, *S.shape[5:])
+    return blocks.reshape(components * nodes, components * nodes, *S.shape[5:])
 
 
 def dense_matrix(S: Stencil) -> Float[Array, "n n"]:

@@ -290,13 +290,15 @@ def test_guard_is_the_whole_stiffness_of_a_face_that_just_touches():
 # The linearised law of a Newton step
 
 
+def _iterate(pressure, history):
+    return ContactIterate(pressure, jnp.zeros_like(history.elastic), jnp.zeros_like(history.pressure))
+
+
 @pytest.mark.parametrize("state", ["sticking", "sliding"])
 def test_law_linearised_at_its_own_pressure_changes_nothing(state, rough):
     face, x, history = bumpy_state(state, rough)
     point = face.at_points(NOW, _points(face, x), history)
-    law = face.tangent_law(
-        NOW, gather_face(x), history, ContactIterate(point.pressure, jnp.zeros_like(history.elastic)), jnp.ones(())
-    )
+    law = face.tangent_law(NOW, gather_face(x), history, _iterate(point.pressure, history), jnp.ones(()))
     assert isinstance(law, TangentLaw)
     own, linear = _force(face, x, history), _force(face, x, history, law)
     np.testing.assert_allclose(linear, own, 10 * ROUNDOFF, 10 * ROUNDOFF * np.abs(own).max())
@@ -309,7 +311,7 @@ def test_linearised_law_is_the_tangent_at_the_iterates_pressure():
     face = contact_face(op.Contact(EXPONENTIAL, friction=0.0))
     x = jnp.array(flat(0.009))
     history = face.initial_history(gather_face(x))
-    start = ContactIterate(jnp.full_like(history.pressure, 0.02), jnp.zeros_like(history.elastic))
+    start = _iterate(jnp.full_like(history.pressure, 0.02), history)
     law = face.tangent_law(NOW, gather_face(x), history, start, jnp.ones(()))
     low, high = 0.0, 1.0
     for _ in range(200):  # bisection for the s of this pressure
@@ -330,12 +332,10 @@ def test_pressure_follows_the_clearance_over_a_step():
     law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
     change = moved(np.zeros(x.shape), z=-0.004)
     for length in (1.0, 0.5):
-        after = face.follow(NOW, gather_face(x), gather_face(change), history, law, jnp.asarray(length))
+        after = face.follow(NOW, gather_face(x), gather_face(change), history, law).after(jnp.asarray(length))
         np.testing.assert_allclose(after.pressure, 7.0 * (0.01 + 0.004 * length), ROUNDOFF)
-    opened = face.follow(
-        NOW, gather_face(x), gather_face(moved(np.zeros(x.shape), z=0.1)), history, law, jnp.asarray(1.0)
-    )
-    np.testing.assert_array_equal(opened.pressure, 0.0)
+    opened = face.follow(NOW, gather_face(x), gather_face(moved(np.zeros(x.shape), z=0.1)), history, law)
+    np.testing.assert_array_equal(opened.after(jnp.asarray(1.0)).pressure, 0.0)
 
 
 @pytest.mark.parametrize(("back", "sticks"), [(0.01, False), (-0.01, True)])
@@ -344,7 +344,7 @@ def test_a_sliding_point_that_reverses_sticks_for_one_step(back, sticks):
     x = jnp.array(flat(-0.01))
     history = _advance(face, x, face.initial_history(gather_face(x)))
     law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
-    slid = face.follow(NOW, gather_face(moved(x, x=0.02)), gather_face(jnp.zeros_like(x)), history, law, jnp.ones(()))
+    slid = face.follow(NOW, gather_face(moved(x, x=0.02)), gather_face(jnp.zeros_like(x)), history, law)
     np.testing.assert_allclose(slid.direction[0], 1e-3, ROUNDOFF)
     following = face.tangent_law(NOW, gather_face(moved(x, x=back)), history, slid, jnp.ones(()))
     assert np.all(following.sticks == sticks)
