@@ -18,6 +18,8 @@ def apart(function: Callable, *args: Any) -> Any:
     one condition for all lanes under `jax.vmap`. GPUs fuse better and would wait for the predicate: no border there.
     """
 
+    function = jax.jit(function)  # traced once for both
+
     def bordered(*args):
         results = jax.eval_shape(function, *args)
         never = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), results)

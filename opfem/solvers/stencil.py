@@ -66,14 +66,14 @@ def _product(S: PartStencil, u: PartNodal) -> PartNodal:
     along_z, along_y, nodes = shape[1] * shape[2], shape[2], int(np.prod(shape))
     furthest = along_z + along_y + 1
     components = len(u)
-    padded = jnp.pad(u.reshape(components, nodes), ((0, 0), (furthest, furthest)))
-    blocks = S.reshape(27, components, components, nodes)
+    padded = [jnp.pad(row, furthest) for row in jax.lax.split(u.reshape(-1), [nodes] * components)]
+    blocks = iter(jax.lax.split(S.reshape(-1), [nodes] * (27 * components**2)))
     rows = [jnp.zeros(nodes, jnp.result_type(S, u))] * components
-    for block, (dz, dy, dx) in zip(blocks, itertools.product(range(3), repeat=3), strict=True):
+    for dz, dy, dx in itertools.product(range(3), repeat=3):
         shift = dz * along_z + dy * along_y + dx
-        neighbour = jax.lax.slice_in_dim(padded, shift, shift + nodes, axis=1)
+        neighbour = [jax.lax.slice(row, [shift], [shift + nodes]) for row in padded]
         for i, j in itertools.product(range(components), repeat=2):
-            rows[i] = rows[i] + block[i, j] * neighbour[j]
+            rows[i] = rows[i] + next(blocks) * neighbour[j]
     return jnp.stack(rows).reshape(u.shape)
 
 
