@@ -208,23 +208,34 @@ def solve_increment(
     )
 
 
-def solve_tangent(problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton) -> KrylovResult:
+def solve_tangent(
+    problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton, transposed: bool = False
+) -> KrylovResult:
     """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
 
-    In float32, like the tangent.
+    In float32, like the tangent. A transposed one is preconditioned from the left: then, too, the Krylov space is
+    that of the preconditioned tangent, or its transpose. From the right it would hold moves that press on stiff
+    contact, for which the friction of a transposed tangent is a large force.
     """
     scale = problem.stress_scale
     b = b.scaled(scale)
     size = jnp.sqrt(sum(jnp.vdot(part, part) for part in jax.tree.leaves(b)))
     size = jnp.where(size > 0, size, 1.0)
+    b = jax.tree.map(lambda part: (part / size).astype(jnp.float32), b)
 
     def inside(x: Unknowns) -> Unknowns:
         return x._replace(u=problem.project(x.u, held))
 
+    def multiply(v):
+        return inside(tangent.apply(v))
+
+    def precondition(v):
+        return inside(tangent.precondition(v))
+
     result = fgmres(
-        lambda v: inside(tangent.apply(v)),
-        lambda v: inside(tangent.precondition(v)),
-        jax.tree.map(lambda part: (part / size).astype(jnp.float32), b),
+        (lambda v: precondition(multiply(v))) if transposed else multiply,
+        (lambda v: v) if transposed else precondition,
+        precondition(b) if transposed else b,
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,
         max_iterations=settings.krylov_steps,

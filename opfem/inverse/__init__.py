@@ -1,0 +1,10 @@
+"""From measured thickness to traction: least squares through the solver, and faster estimates."""
+
+from .estimates import (
+    LinearEstimate as LinearEstimate,
+    linear_estimate as linear_estimate,
+    uniaxial_estimate as uniaxial_estimate,
+)
+from .fit import fit_traction as fit_traction
+from .prior import Matern as Matern, Tikhonov as Tikhonov
+from .result import FIT_RESULTS as FIT_RESULTS, TractionFit as TractionFit

@@ -1,0 +1,134 @@
+"""Estimates of the pressure without finite elements: small-strain elasticity of the layer, and uniaxial compression."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..measurement import ThicknessMap
+from ..model import Bonded, Palpation
+from ..model.deformation import kinematics
+from ..model.material import AbstractMaterial
+from .gauss_newton import LeastSquares, least_squares
+from .noise import noise_std
+from .observation import Nodes, Observation, observe
+from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes
+from .transfer import poisson_ratio, transfer_function, wave_numbers
+
+# Relative gradient at which the linear estimate counts as solved, and most iterations.
+_RTOL = 1e-8
+_STEPS = 1000
+# Passes that find the volume ratio in uniaxial compression; each shortens the error by about shear / bulk.
+_VOLUME_STEPS = 60
+
+
+class LinearEstimate(eqx.Module):
+    """The pressure that small-strain elasticity of a flat layer gives.
+
+    Attributes:
+        normal: Pressure per reference area at the interface's nodes `(ny+1, nx+1)` [MPa].
+        heights: Height of the interface under it [mm].
+        chi2: Sum of squared standardised misfits [-].
+    """
+
+    normal: Nodes
+    heights: Nodes
+    chi2: Array
+
+
+def response(palpation: Palpation) -> Float[Array, "my mx"]:
+    """Compute the indentation per pressure of every cosine mode [mm/MPa]; a window with friction counts as slipping."""
+    mesh, material = palpation.mesh(), palpation.layer.material
+    base = "bonded" if isinstance(palpation.window, Bonded) else "slip"
+    k = wave_numbers(mesh.thickness.shape, mesh.spacing)
+    return transfer_function(k, jnp.mean(mesh.thickness), material.shear, poisson_ratio(material), base)
+
+
+def preconditioner(palpation: Palpation, observation: Observation, prior: AbstractPrior):
+    """Build the approximate inverse of the fit's normal matrix: diagonal in cosine modes."""
+    mesh = palpation.mesh()
+    k = wave_numbers(mesh.thickness.shape, mesh.spacing)
+    seen = (prior.mode_std(k, mesh.spacing) * response(palpation)) ** 2 * observation.precision
+    return Diagonal(1.0 / (jnp.asarray(prior.penalised(k.shape)) + seen))
+
+
+class Diagonal(eqx.Module):
+    """Multiplication with a diagonal matrix."""
+
+    values: Array
+
+    def __call__(self, v: Array) -> Array:
+        """Multiply."""
+        return self.values * v
+
+
+def solve_linear(palpation: Palpation, observation: Observation, prior: AbstractPrior) -> LeastSquares:
+    """Find the white unknowns of the linear estimate."""
+    mesh = palpation.mesh()
+    gain, held = response(palpation), jnp.asarray(prior.penalised(mesh.thickness.shape))
+    mean = on_nodes(prior, mesh.thickness.shape)
+
+    def indentation(normal):
+        return from_cosines(gain * cosine_transform(normal))
+
+    def jacobian(white):
+        return observation.misfit_change(-indentation(prior.expand(white, mesh.spacing))), held * white
+
+    _, pull = jax.vjp(jacobian, jnp.zeros(mesh.thickness.shape))
+    start = observation.misfit(mesh.thickness - indentation(mean)), jnp.zeros(mesh.thickness.shape)
+    precondition = preconditioner(palpation, observation, prior)
+    b = jax.tree.map(jnp.negative, start)
+    return least_squares(jacobian, lambda r: pull(r)[0], precondition, b, _RTOL, _STEPS)
+
+
+def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: AbstractPrior) -> LinearEstimate:
+    """Estimate the pressure by small-strain elasticity, instantly.
+
+    The layer counts as flat, of its mean thickness; without friction at the window unless bonded there; and its
+    points as not moving sideways. Good up to a few percent of strain.
+
+    Args:
+        palpation: The experiment.
+        thickness: The measured map, its `std` known; masked pixels need no fill.
+        prior: What is known of the pressure.
+
+    Raises:
+        ValueError: If the map's std is missing or not positive, or the map does not touch the layer's field.
+    """
+    mesh = palpation.mesh()
+    observation = observe(mesh, thickness, noise_std("linear_estimate", thickness))
+    white = solve_linear(palpation, observation, prior).x
+    normal = on_nodes(prior, white.shape) + prior.expand(white, mesh.spacing)
+    heights = mesh.thickness - from_cosines(response(palpation) * cosine_transform(normal))
+    return LinearEstimate(normal, heights, jnp.sum(observation.misfit(heights) ** 2))
+
+
+def uniaxial_estimate(palpation: Palpation, thickness: ThicknessMap) -> Nodes:
+    """Estimate the pressure as classic optical palpation does: every point by itself in uniaxial compression.
+
+    Returns:
+        Pressure per current area, the Cauchy stress, at the interface's nodes `(ny+1, nx+1)` [MPa].
+
+    Source:
+        Kennedy et al., Optics Letters 39 (2014) 3014: the layer's local strain and its stress–strain curve.
+    """
+    mesh = palpation.mesh()
+    stretch = thickness.sample(*mesh.plane()) / mesh.thickness
+    return -uniaxial_stress(palpation.layer.material, stretch)
+
+
+def uniaxial_stress(material: AbstractMaterial, stretch: Array) -> Array:
+    """Compute the Cauchy stress [MPa] at an axial stretch [-], the sides free."""
+
+    def stresses(J):
+        side = jnp.sqrt(J / stretch)
+        zero = jnp.zeros_like(stretch)
+        rows = [[side - 1.0, zero, zero], [zero, side - 1.0, zero], [zero, zero, stretch - 1.0]]
+        P = material.isochoric_piola(kinematics(jnp.stack([jnp.stack(row) for row in rows])))
+        return P[0, 0] * side / J, P[2, 2] * stretch / J
+
+    def closer(_, J):
+        return 1.0 - stresses(J)[0] / material.bulk
+
+    lateral, axial = stresses(jax.lax.fori_loop(0, _VOLUME_STEPS, closer, jnp.ones_like(stretch)))
+    return axial - lateral

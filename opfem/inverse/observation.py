@@ -1,0 +1,169 @@
+"""The measured map as the fit sees it: a surface on mesh-spaced cubic splines, and how certain it is.
+
+The map is projected once. What the splines cannot follow (`representation`) says nothing about the traction and is
+kept apart from the noise. The deformed interface is then looked at from the map: at every node of the mesh's own grid
+in space, the interface's height there, whichever point of the layer has moved below.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import Map
+from ..measurement import ThicknessMap
+from ..model import HeightField, LayerMesh
+
+Nodes = Float[Array, "my mx"]
+# Gaussian standard deviation over its full width at half maximum.
+_PER_FWHM = 1.0 / np.sqrt(8.0 * np.log(2.0))
+# Stiffness of the splines between pixels, over the mean precision of a node: what masked nodes follow.
+_BENDING = 1e-6
+# Fixed-point steps to find which point of the interface lies at a place. Each shortens the distance by the lateral
+# displacement gradient.
+_LOCATING_STEPS = 40
+# How near the search must come, in elements, for the place to count as found.
+_FOUND = 1e-6
+# Pixels this far outside, in elements, still lie on the layer: round-off of its edge.
+_ON_EDGE = 1e-9
+
+
+class Observation(eqx.Module):
+    """A measured surface on the mesh's grid.
+
+    Attributes:
+        surface: Height of the measured surface at the grid's nodes [mm].
+        to_rows: Rows of pixels from rows of nodes `(py, my)`.
+        to_columns: Columns of pixels from columns of nodes `(px, mx)`.
+        certainty: One over the standard deviation of every pixel [1/mm], correlation counted in; 0 where none.
+        representation: Pixels minus the surface [mm], 0 where no pixel counts.
+        informed: How many spline coefficients the pixels determine [-].
+    """
+
+    surface: Nodes
+    to_rows: Float[Array, "py my"]
+    to_columns: Float[Array, "px mx"]
+    certainty: Map
+    representation: Map
+    informed: Array
+
+    def misfit(self, heights: Nodes) -> Map:
+        """Compare heights of the interface [mm] with the measured surface, pixel by pixel, over its noise [-]."""
+        return self.misfit_change(heights - self.surface)
+
+    def misfit_change(self, change: Nodes) -> Map:
+        """Compute how the misfit changes with the interface's heights [-]."""
+        return self.certainty * (self.to_rows @ change @ self.to_columns.T)
+
+    @property
+    def precision(self) -> Array:
+        """Mean certainty of a node, squared [1/mm²]."""
+        return jnp.sum(self.certainty**2) / self.surface.size
+
+    @property
+    def representation_rms(self) -> Array:
+        """Root mean square of what the splines cannot follow [mm]."""
+        counted = jnp.sum(self.certainty > 0)
+        return jnp.sqrt(jnp.sum(self.representation**2) / jnp.maximum(counted, 1))
+
+
+def observe(mesh: LayerMesh, thickness: ThicknessMap, std: Array) -> Observation:
+    """Project a map onto the mesh's splines.
+
+    Noise that is correlated over less than about two elements acts like white noise of the same power at long
+    waves; it enters as that, which takes its shorter waves for a little larger than they are.
+
+    Args:
+        mesh: The layer's mesh.
+        thickness: The measured map.
+        std: Standard deviation of the noise of its pixels [mm], a number or a map.
+    """
+    (hx, hy), (my, mx) = mesh.spacing, mesh.thickness.shape
+    rows, inside_y = _spline_values(thickness.y / hy, my - 1)
+    columns, inside_x = _spline_values(thickness.x / hx, mx - 1)
+    counted = inside_y[:, None] & inside_x & ~thickness.mask
+    sigma = jnp.broadcast_to(std, thickness.shape) * jnp.sqrt(_correlated_pixels(thickness))
+    certainty = jnp.where(counted, 1.0 / jnp.where(counted, sigma, 1.0), 0.0)
+    values = jnp.where(counted, thickness.values, 0.0)
+
+    weight = certainty**2
+    precision = jnp.sum(weight) / (my * mx)
+    bends_y, bends_x = (jnp.asarray(_bending(n)) for n in (my, mx))
+
+    def normal(v):
+        data = rows.T @ (weight * (rows @ v @ columns.T)) @ columns
+        return data + _BENDING * precision * (bends_y @ v + v @ bends_x)
+
+    right = rows.T @ (weight * values) @ columns
+    surface, _ = jax.scipy.sparse.linalg.cg(normal, right, tol=1e-12, maxiter=40 * max(my, mx))
+    representation = jnp.where(counted, values - rows @ surface @ columns.T, 0.0)
+    share = (rows**2).T @ weight @ columns**2 / jnp.where(precision > 0, precision, 1.0)
+    return Observation(surface, rows, columns, certainty, representation, jnp.sum(share > 1e-3))
+
+
+def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
+    """Find the height of the deformed interface [mm] at the places of the mesh's undeformed nodes.
+
+    Beyond the layer's edges it continues at its edge value.
+
+    Args:
+        mesh: The layer's mesh.
+        u: Displacement of the interface's nodes [mm].
+    """
+    (hx, hy), (my, mx) = mesh.spacing, mesh.thickness.shape
+    to_y, to_x = (jnp.asarray(_interpolation(n)) for n in (my, mx))
+    place = jnp.stack(mesh.plane())
+    far = jnp.stack([hx * (mx - 1), hy * (my - 1)])[:, None, None]
+
+    def spline(values):
+        return HeightField(to_y @ values @ to_x.T, jnp.stack([-hx, -hy]), jnp.stack([hx, hy]), "cubic")
+
+    moved, height = (spline(u[0]), spline(u[1])), spline(mesh.thickness + u[2])
+    frozen = jax.lax.stop_gradient(moved)
+
+    def closer(_, at):
+        return jnp.clip(place - jnp.stack([field(*at)[0] for field in frozen]), 0.0, far)
+
+    at = jax.lax.fori_loop(0, _LOCATING_STEPS, closer, place)
+    # One Newton step carries the derivative; across an edge that the place lies beyond there is none.
+    values, slope_x, slope_y = (jnp.stack(part) for part in zip(*(field(*at) for field in moved), strict=True))
+    off = place - at - values
+    found = jax.lax.stop_gradient(jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None])
+    off = jnp.where(found, off, 0.0)
+    (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(found, slope, 0.0)) for slope in (slope_x, slope_y))
+    determinant = (1.0 + a) * (1.0 + d) - b * c
+    step = jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
+    return height(*(at + step))[0]
+
+
+def _spline_values(t: Float[Array, " points"], cells: int) -> tuple[Array, Array]:
+    """Return the matrix from node values to a spline's values at points, in cells; and which points lie on it."""
+    distance = jnp.abs(t[:, None] - np.arange(-1, cells + 2))
+    basis = (jnp.maximum(2.0 - distance, 0.0) ** 3 - 4.0 * jnp.maximum(1.0 - distance, 0.0) ** 3) / 6.0
+    inside = (t >= -_ON_EDGE) & (t <= cells + _ON_EDGE)
+    return jnp.where(inside[:, None], basis @ jnp.asarray(_interpolation(cells + 1)), 0.0), inside
+
+
+def _interpolation(n: int) -> np.ndarray:
+    """Return the matrix from node values to cubic B-spline coefficients, one more at each end (not-a-knot)."""
+    rows = np.zeros((n + 2, n + 2))
+    rows[np.arange(n)[:, None], np.arange(n)[:, None] + [0, 1, 2]] = np.array([1.0, 4.0, 1.0]) / 6.0
+    rows[n, :5] = rows[n + 1, -5:] = [1.0, -4.0, 6.0, -4.0, 1.0]
+    return np.linalg.inv(rows)[:, :n]
+
+
+def _bending(n: int) -> np.ndarray:
+    second = np.diff(np.eye(n), n=2, axis=0)
+    return second.T @ second
+
+
+def _correlated_pixels(thickness: ThicknessMap) -> Array:
+    """Compute how many pixels share one pixel's noise: the sum of its correlations with all others, itself included."""
+    scale = thickness.noise_length * _PER_FWHM
+
+    def along(spacing, n):
+        d = spacing * jnp.arange(1, n)
+        return 1.0 + 2.0 * jnp.sum(jnp.exp(-(d**2) / jnp.where(scale > 0, 4.0 * scale**2, 1.0))) * (scale > 0)
+
+    return along(thickness.spacing[0], thickness.shape[1]) * along(thickness.spacing[1], thickness.shape[0])

@@ -1,0 +1,66 @@
+"""What pressure of one wavelength does to a layer at small strain: its transfer function.
+
+u_z(h) = -G(k) p cos(k x) for a pressure p cos(k x) on a layer of thickness h. The starting point of the traction fit,
+its preconditioner, and by itself the fastest estimate.
+"""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..model.material import AbstractMaterial
+
+Base = Literal["bonded", "slip"]
+# Beyond this k h, hyperbolic functions are exponentials and the layer is as good as infinitely deep.
+_DEEP = 300.0
+# Below this k h, numerator and denominator lose digits; G differs from its limit by less than 1e-8 there.
+_SHALLOW = 1e-4
+
+
+def poisson_ratio(material: AbstractMaterial) -> Array:
+    """Compute Poisson's ratio at small strain [-]; 1/2 for an infinite bulk modulus."""
+    ratio = material.shear / material.bulk
+    return (3.0 - 2.0 * ratio) / (6.0 + 2.0 * ratio)
+
+
+def transfer_function(
+    k: Float[Array, "*modes"], thickness: Array, shear: Array, poisson: Array, base: Base
+) -> Float[Array, "*modes"]:
+    """Compute G(k) [mm/MPa], indentation per pressure.
+
+    Args:
+        k: Wave numbers [1/mm].
+        thickness: Of the layer [mm].
+        shear: Shear modulus [MPa].
+        poisson: Poisson's ratio [-], 1/2 included.
+        base: What holds the other side: "bonded", or "slip" without friction.
+
+    Source:
+        Plane-strain elasticity of a layer; for the bonded one Johnson, Contact Mechanics, section 5.8.
+    """
+    x = jnp.clip(k * thickness, _SHALLOW, _DEEP)
+    # Hyperbolic functions over exp(2 x).
+    decay = jnp.exp(-4.0 * x)
+    sinh, cosh, one = 0.5 * (1.0 - decay), 0.5 * (1.0 + decay), jnp.exp(-2.0 * x)
+    if base == "bonded":
+        a = 3.0 - 4.0 * poisson
+        above = a * sinh - 2.0 * x * one
+        below = a * cosh + (2.0 * x**2 + 5.0 - 12.0 * poisson + 8.0 * poisson**2) * one
+        shallow = (1.0 - 2.0 * poisson) / (2.0 * (1.0 - poisson))
+    else:
+        above = cosh - one
+        below = sinh + 2.0 * x * one
+        shallow = 0.5 * (1.0 - poisson)
+    moderate = (1.0 - poisson) / x * above / below
+    deep = (1.0 - poisson) / jnp.maximum(k * thickness, _DEEP)
+    per_shear = jnp.where(k * thickness < _SHALLOW, shallow, jnp.where(k * thickness > _DEEP, deep, moderate))
+    return per_shear * thickness / shear
+
+
+def wave_numbers(shape: tuple[int, int], spacing: tuple[Array, Array]) -> Float[Array, "my mx"]:
+    """Compute the wave number [1/mm] of every mode of a two-dimensional cosine transform on nodes."""
+    (my, mx), (hx, hy) = shape, spacing
+    ky = jnp.pi * jnp.arange(my) / (my * hy)
+    kx = jnp.pi * jnp.arange(mx) / (mx * hx)
+    return jnp.sqrt(ky[:, None] ** 2 + kx**2)
