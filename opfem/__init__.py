@@ -8,6 +8,16 @@ from typing import Any
 
 from . import datasets as datasets
 from .compilation import cache_compilation as cache_compilation
+from .inverse import (
+    FitStatus as FitStatus,
+    LinearEstimate as LinearEstimate,
+    Matern as Matern,
+    Tikhonov as Tikhonov,
+    TractionFit as TractionFit,
+    fit_traction as fit_traction,
+    linear_estimate as linear_estimate,
+    uniaxial_estimate as uniaxial_estimate,
+)
 from .io import (
     read_netcdf as read_netcdf,
     read_thickness as read_thickness,

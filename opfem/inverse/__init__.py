@@ -7,4 +7,4 @@ from .estimates import (
 )
 from .fit import fit_traction as fit_traction
 from .prior import Matern as Matern, Tikhonov as Tikhonov
-from .result import FIT_RESULTS as FIT_RESULTS, TractionFit as TractionFit
+from .result import FitStatus as FitStatus, TractionFit as TractionFit

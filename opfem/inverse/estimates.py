@@ -36,37 +36,21 @@ class LinearEstimate(eqx.Module):
     chi2: Array
 
 
-def response(palpation: Palpation) -> Float[Array, "my mx"]:
+def response(palpation: Palpation, thickness: Array) -> Float[Array, "my mx"]:
     """Compute the indentation per pressure of every cosine mode [mm/MPa]; a window with friction counts as slipping."""
     mesh, material = palpation.mesh(), palpation.layer.material
     base = "bonded" if isinstance(palpation.window, Bonded) else "slip"
     k = wave_numbers(mesh.thickness.shape, mesh.spacing)
-    return transfer_function(k, jnp.mean(mesh.thickness), material.shear, poisson_ratio(material), base)
-
-
-def preconditioner(palpation: Palpation, observation: Observation, prior: AbstractPrior):
-    """Build the approximate inverse of the fit's normal matrix: diagonal in cosine modes."""
-    mesh = palpation.mesh()
-    k = wave_numbers(mesh.thickness.shape, mesh.spacing)
-    seen = (prior.mode_std(k, mesh.spacing) * response(palpation)) ** 2 * observation.precision
-    return Diagonal(1.0 / (jnp.asarray(prior.penalised(k.shape)) + seen))
-
-
-class Diagonal(eqx.Module):
-    """Multiplication with a diagonal matrix."""
-
-    values: Array
-
-    def __call__(self, v: Array) -> Array:
-        """Multiply."""
-        return self.values * v
+    return transfer_function(k, thickness, material.shear, poisson_ratio(material), base)
 
 
 def solve_linear(palpation: Palpation, observation: Observation, prior: AbstractPrior) -> LeastSquares:
     """Find the white unknowns of the linear estimate."""
     mesh = palpation.mesh()
-    gain, held = response(palpation), jnp.asarray(prior.penalised(mesh.thickness.shape))
+    gain, held = response(palpation, jnp.mean(mesh.thickness)), jnp.asarray(prior.penalised(mesh.thickness.shape))
     mean = on_nodes(prior, mesh.thickness.shape)
+    spread = prior.mode_std(wave_numbers(held.shape, mesh.spacing), mesh.spacing)
+    diagonal = held**2 + (spread * gain) ** 2 * jnp.mean(observation.precision)
 
     def indentation(normal):
         return from_cosines(gain * cosine_transform(normal))
@@ -74,11 +58,10 @@ def solve_linear(palpation: Palpation, observation: Observation, prior: Abstract
     def jacobian(white):
         return observation.misfit_change(-indentation(prior.expand(white, mesh.spacing))), held * white
 
-    _, pull = jax.vjp(jacobian, jnp.zeros(mesh.thickness.shape))
-    start = observation.misfit(mesh.thickness - indentation(mean)), jnp.zeros(mesh.thickness.shape)
-    precondition = preconditioner(palpation, observation, prior)
+    _, pull = jax.vjp(jacobian, jnp.zeros(held.shape))
+    start = observation.misfit(mesh.thickness - indentation(mean)), jnp.zeros(held.shape)
     b = jax.tree.map(jnp.negative, start)
-    return least_squares(jacobian, lambda r: pull(r)[0], precondition, b, _RTOL, _STEPS)
+    return least_squares(jacobian, lambda r: pull(r)[0], lambda r: r / diagonal, b, _RTOL, _STEPS)
 
 
 def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: AbstractPrior) -> LinearEstimate:
@@ -99,7 +82,7 @@ def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: Abstra
     observation = observe(mesh, thickness, noise_std("linear_estimate", thickness))
     white = solve_linear(palpation, observation, prior).x
     normal = on_nodes(prior, white.shape) + prior.expand(white, mesh.spacing)
-    heights = mesh.thickness - from_cosines(response(palpation) * cosine_transform(normal))
+    heights = mesh.thickness - from_cosines(response(palpation, jnp.mean(mesh.thickness)) * cosine_transform(normal))
     return LinearEstimate(normal, heights, jnp.sum(observation.misfit(heights) ** 2))
 
 

@@ -1,33 +1,31 @@
 """`fit_traction`: the traction that explains a measured map, with its uncertainty (route B)."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from .._checks import concrete
 from ..measurement import ThicknessMap
 from ..model import Contact, Palpation, Traction
 from ..solvers import Newton, solve
 from ..solvers.progress import FitProgress
-from .estimates import preconditioner, solve_linear
+from .estimates import solve_linear
 from .forward import press
 from .gauss_newton import GaussNewton, PreconditionedDescent
 from .noise import noise_std
 from .observation import Nodes, Observation, interface_heights, observe
 from .posterior import Posterior
-from .prior import AbstractPrior, on_nodes
-from .result import FIT_RESULTS, TractionFit
+from .preconditioner import layer_normal
+from .prior import AbstractPrior, Matern, on_nodes
+from .result import FitStatus, TractionFit
 
 # Relative gradient of each Gauss–Newton system, and most iterations.
 _CG_RTOL = 1e-2
 _CG_STEPS = 60
 # Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then halved.
 _NOT_CARRIED = 1e4
-# Halvings of the linear estimate until the layer carries it.
-_MOST_HALVINGS = 6
 
 
 class Misfit(eqx.Module):
@@ -59,8 +57,8 @@ def _misfit(white: Nodes, misfit: Misfit):
 @eqx.filter_jit
 def _step(solver, white, misfit, state):
     white, state, aux = solver.step(_misfit, white, misfit, {}, state, frozenset())
-    done, result = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
-    return white, state, aux, done, result
+    done, _ = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
+    return white, state, aux, done
 
 
 @eqx.filter_jit
@@ -109,9 +107,8 @@ def fit_traction(
     observation = eqx.filter_jit(observe)(mesh, thickness, std)
     misfit = Misfit(palpation, observation, prior, solver.as_leaves())
     white = eqx.filter_jit(solve_linear)(palpation, observation, prior).x
-    descent = PreconditionedDescent(
-        preconditioner(palpation, observation, prior), jnp.asarray(_CG_RTOL), jnp.asarray(_CG_STEPS)
-    )
+    precondition = layer_normal(palpation, observation, prior)
+    descent = PreconditionedDescent(precondition, jnp.asarray(_CG_RTOL), jnp.asarray(_CG_STEPS))
     gauss_newton = GaussNewton(jnp.asarray(rtol), jnp.asarray(rtol), descent)
     white, state, aux, steps, result = _iterate(gauss_newton, white, misfit, max_steps, progress)
 
@@ -150,8 +147,8 @@ def fit_traction(
         prior=prior,
         deviations=deviations,
     )
-    if throw and bool(result != FIT_RESULTS.successful):
-        raise RuntimeError(f"The fit stopped after {steps} forward solves. {FIT_RESULTS[result]}")
+    if throw and bool(result != FitStatus.successful):
+        raise RuntimeError(f"The fit stopped after {steps} forward solves. {FitStatus[result]}")
     return fit
 
 
@@ -160,22 +157,32 @@ def _iterate(gauss_newton, white, misfit: Misfit, max_steps: int, progress: bool
     state = gauss_newton.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
     with FitProgress(progress) as bar:
         for step in range(1, max_steps + 1):
-            white, state, aux, done, result = _step(gauss_newton, white, misfit, state)
+            white, state, aux, done = _step(gauss_newton, white, misfit, state)
             loss = float(state.f_info.as_min())
             bar.show(step, loss, int(state.descent_state.iterations))
             if not bool(aux["carried"]):
-                return white, state, aux, step, FIT_RESULTS.not_carried
+                return white, state, aux, step, FitStatus.not_carried
             if not jnp.isfinite(loss) or not bool(jnp.all(jnp.isfinite(state.y_eval))):
-                return white, state, aux, step, FIT_RESULTS.nonfinite
+                return white, state, aux, step, FitStatus.nonfinite
             if bool(done):
-                return white, state, aux, step, FIT_RESULTS.successful
-    return white, state, aux, max_steps, FIT_RESULTS.max_steps_reached
+                return white, state, aux, step, FitStatus.successful
+    return white, state, aux, max_steps, FitStatus.max_steps_reached
 
 
-def _check(palpation: Palpation, prior: Any) -> None:
+def _check(palpation: Palpation, prior: AbstractPrior) -> None:
     if not isinstance(palpation.sample, Contact):
         raise ValueError(
             f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
         )
     if not isinstance(prior, AbstractPrior):
         raise ValueError(f"fit_traction needs a prior, Matern(...) or Tikhonov(...), got {type(prior).__name__}.")
+    nx, ny, _ = palpation.elements
+    if min(nx, ny) < 4:
+        raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
+    length = concrete(prior.length) if isinstance(prior, Matern) else None
+    size = concrete(jnp.stack(palpation.mesh().spacing).max())
+    if length is not None and size is not None and np.any(length < size):
+        raise ValueError(
+            f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh cannot "
+            "follow it. Pass a longer length, or Palpation(elements=...) with more."
+        )

@@ -57,9 +57,9 @@ class Observation(eqx.Module):
         return self.certainty * (self.to_rows @ change @ self.to_columns.T)
 
     @property
-    def precision(self) -> Array:
-        """Mean certainty of a node, squared [1/mm²]."""
-        return jnp.sum(self.certainty**2) / self.surface.size
+    def precision(self) -> Nodes:
+        """How certain the surface is near every node [1/mm²]: row sums of the inverse covariance."""
+        return jnp.abs(self.to_rows).T @ self.certainty**2 @ jnp.abs(self.to_columns)
 
     @property
     def representation_rms(self) -> Array:

@@ -10,7 +10,7 @@ from .gauss_newton import LeastSquares, least_squares
 from .observation import Nodes
 
 # Relative gradient of each draw's linear system, and most iterations.
-_RTOL = 3e-3
+_RTOL = 1e-2
 _STEPS = 200
 
 

@@ -4,7 +4,6 @@ A prior turns white noise into tractions, `mean + expand(white)`: what is fitted
 itself costs nothing and its preconditioner is at hand. All of it by cosine transforms, O(n log n).
 """
 
-
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.fft

@@ -14,7 +14,7 @@ from .posterior import Posterior
 from .prior import AbstractPrior
 
 
-class FIT_RESULTS(eqx.Enumeration):
+class FitStatus(eqx.Enumeration):
     """How a fit ended."""
 
     successful = ""
@@ -58,7 +58,7 @@ class TractionFit(eqx.Module):
     observed: Array
     residual: Nodes
     stats: dict[str, Any]
-    result: FIT_RESULTS
+    result: FitStatus
     posterior: Posterior
     prior: AbstractPrior
     deviations: Float[Array, "draws my mx"]

@@ -17,7 +17,6 @@ def apart(function: Callable, *args: Any) -> Any:
     Nothing is fused across a conditional. This one has a known predicate, hidden from the compiler; so it stays
     one condition for all lanes under `jax.vmap`. GPUs fuse better and would wait for the predicate: no border there.
     """
-
     function = jax.jit(function)  # traced once for both
 
     def bordered(*args):

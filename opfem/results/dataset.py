@@ -9,9 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._checks import concrete
+from ..inverse import FitStatus, TractionFit
 from ..model import Imprint
 from ..solvers import RESULTS, FaceResult, Solution
 from .fields import under_pixels
@@ -44,18 +45,28 @@ _STATS = {
     "max_penetration": ("mm", "largest penetration"),
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
 }
+_FIT_STATS = {
+    "forward_solves": ("1", "solves under a trial traction"),
+    "inner_iterations": ("1", "products with the Jacobian and with its transpose, of all Gauss–Newton steps"),
+    "posterior_iterations": ("1", "the same of all draws of the posterior"),
+    "draws": ("1", "draws of the posterior that standard deviations come from"),
+    "std_error": ("1", "relative standard error of the standard deviations"),
+    "representation_rms": ("mm", "root mean square of what the map has beyond mesh-spaced splines"),
+    "misfit_rms": ("mm", "root mean square of interface minus measured surface"),
+}
 Variable = tuple[tuple[str, ...], Any, dict[str, Any]]
 
 
-def to_xarray(solution: Solution, *, interior: bool = False) -> xr.Dataset:
-    """Label a solution: dims, positions, units, and how it was made.
+def to_xarray(solution: Solution | TractionFit, *, interior: bool = False) -> xr.Dataset:
+    """Label a solution, or a fit: dims, positions, units, and how it was made.
 
     Everything is in mm, N and MPa. Interface nodes are `y`, `x`; `x_current` and `y_current` say where
     they have moved. `thickness` and `pressure_image` are on the pixels of the load's map, NaN where no
     interface point lies under a pixel. Fields of a failed solve are NaN, its `contact_status` -1.
 
     Args:
-        solution: One solution, outside jit.
+        solution: One solution or fit, outside jit. A fit adds `pressure_std`, `normal_std`, `residual` and what
+            says how well it explains the map.
         interior: Also take `stress`, `green_strain` and `energy_density` at every node, as `layer_fields`
             recovers them.
 
@@ -69,6 +80,10 @@ def to_xarray(solution: Solution, *, interior: bool = False) -> xr.Dataset:
         ...     data = op.to_xarray(solution)
         ...     return 1e3 * data.pressure  # kPa
     """
+    if isinstance(solution, TractionFit):
+        return (
+            to_xarray(solution.solution, interior=interior).assign(_fit(solution)).assign_attrs(_fit_record(solution))
+        )
     _require_one(solution)
     failed = status_name(solution) not in ("successful", "slides_off")
     variables = {
@@ -76,7 +91,7 @@ def to_xarray(solution: Solution, *, interior: bool = False) -> xr.Dataset:
         **_face("", "at the sample", solution.sample, failed),
         **_face("window_", "at the window", solution.window, failed),
         **_image(solution),
-        **_stats(solution.stats),
+        **_stats(solution.stats, _STATS),
         **(_interior(solution) if interior else {}),
     }
     coordinates = _coordinates(solution)
@@ -207,12 +222,37 @@ def _pressure_image(
     return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)[0]
 
 
-def _stats(stats: dict[str, Array]) -> dict[str, Variable]:
+def _fit(fit: TractionFit) -> dict[str, Variable]:
+    return {
+        "pressure_std": _variable(NODES, fit.pressure_std, "MPa", "posterior standard deviation of the pressure"),
+        "normal_std": _variable(
+            NODES, fit.normal_std, "MPa", "posterior standard deviation of the normal traction per reference area"
+        ),
+        "residual": _variable(
+            NODES, fit.residual, "mm", "interface minus measured surface at the places of the unloaded nodes"
+        ),
+        "chi2": _variable((), fit.chi2, "1", "sum of squared misfits over their noise"),
+        "effective_dof": _variable((), fit.effective_dof, "1", "degrees of freedom that the map determines"),
+        "observed": _variable((), fit.observed, "1", "independent numbers of the map on the mesh's splines"),
+        **_stats(fit.stats, _FIT_STATS),
+    }
+
+
+def _fit_record(fit: TractionFit) -> dict[str, Any]:
+    names = FitStatus._name_to_item
+    return {
+        "fit_status": next(name for name, item in names.items() if bool(item == fit.result)),
+        "fit_message": FitStatus[fit.result],
+        "prior": json.dumps(describe(fit.prior)),
+    }
+
+
+def _stats(stats: dict[str, Any], labels: dict[str, tuple[str, str]]) -> dict[str, Variable]:
     labelled: dict[str, Variable] = {}
     for name, value in stats.items():
         values = np.asarray(value)
         dims = ("component",) if values.shape == (3,) else tuple(f"{name}_{axis}" for axis in range(values.ndim))
-        unit, long_name = _STATS.get(name, (None, name.replace("_", " ")))
+        unit, long_name = labels.get(name, (None, name.replace("_", " ")))
         labelled[name] = (dims, values, {"long_name": long_name} | ({} if unit is None else {"units": unit}))
     return labelled
 
