@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
 from ..model.deformation import kinematics
@@ -36,7 +37,7 @@ class LinearEstimate(eqx.Module):
     chi2: Array
 
 
-def response(palpation: Palpation, thickness: Array) -> Float[Array, "my mx"]:
+def response(palpation: Palpation, thickness: ScalarLike) -> Float[Array, "my mx"]:
     """Compute the indentation per pressure of every cosine mode [mm/MPa]; a window with friction counts as slipping."""
     mesh, material = palpation.mesh(), palpation.layer.material
     base = "bonded" if isinstance(palpation.window, Bonded) else "slip"

@@ -175,7 +175,7 @@ def _check(palpation: Palpation, prior: AbstractPrior) -> None:
             f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
         )
     if not isinstance(prior, AbstractPrior):
-        raise ValueError(f"fit_traction needs a prior, Matern(...) or Tikhonov(...), got {type(prior).__name__}.")
+        raise ValueError(f"fit_traction.prior must be Matern(...) or Tikhonov(...), got {type(prior).__name__}.")
     nx, ny, _ = palpation.elements
     if min(nx, ny) < 4:
         raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")

@@ -23,8 +23,6 @@ def noise_std(caller: str, thickness: ThicknessMap) -> Array:
     std, mask = concrete(thickness.std), concrete(thickness.mask)
     if std is not None and mask is not None:
         used = np.broadcast_to(std, thickness.shape)[~mask]
-        if used.size == 0:
-            raise ValueError(f"{caller} needs pixels that are data, got a map of {mask.size} pixels, all masked.")
         if not (used > 0).all():
             raise ValueError(
                 f"{caller}: thickness.std [mm] must be positive where pixels are data, got {used.min():g}. "

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Map
+from .._types import Map, ScalarLike
 from ..measurement import ThicknessMap
 from ..model import HeightField, LayerMesh
 
@@ -68,7 +68,7 @@ class Observation(eqx.Module):
         return jnp.sqrt(jnp.sum(self.representation**2) / jnp.maximum(counted, 1))
 
 
-def observe(mesh: LayerMesh, thickness: ThicknessMap, std: Array) -> Observation:
+def observe(mesh: LayerMesh, thickness: ThicknessMap, std: ScalarLike | Map) -> Observation:
     """Project a map onto the mesh's splines.
 
     Noise that is correlated over less than about two elements acts like white noise of the same power at long

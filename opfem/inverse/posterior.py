@@ -1,5 +1,7 @@
 """The posterior around the optimum (Laplace): draws, and what they say of every derived number."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,6 @@ import lineax as lx
 from jaxtyping import Array, PRNGKeyArray
 
 from .gauss_newton import LeastSquares, least_squares
-from .observation import Nodes
 
 # Relative gradient of each draw's linear system, and most iterations.
 _RTOL = 1e-2
@@ -23,23 +24,23 @@ class Posterior(eqx.Module):
         precondition: Approximate inverse of its normal matrix.
     """
 
-    white: Nodes
+    white: Array
     jacobian: lx.AbstractLinearOperator
-    precondition: eqx.Module
+    precondition: Callable[[Array], Array]
 
     def solve(self, b) -> LeastSquares:
         """Find the change of the unknowns that makes residuals change by b, as nearly as possible."""
         J = self.jacobian
         return least_squares(J.mv, J.T.mv, self.precondition, b, _RTOL, _STEPS)
 
-    def covariance(self, weights: Nodes) -> Nodes:
+    def covariance(self, weights: Array) -> Array:
         """Multiply the posterior covariance of the white unknowns with weights."""
         misfit, held = jax.eval_shape(self.jacobian.mv, self.white)
         # The prior's rows are diagonal: they turn a right-hand side into any gradient.
         rows = self.jacobian.mv(jnp.ones_like(self.white))[1]
         return self.solve((jnp.zeros(misfit.shape, misfit.dtype), (weights / rows).astype(held.dtype))).x
 
-    def draw(self, key: PRNGKeyArray) -> tuple[Nodes, Array, Array]:
+    def draw(self, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
         """Draw a deviation from the optimum.
 
         Least squares against white noise in every residual has exactly the posterior's covariance.

@@ -8,12 +8,11 @@ cost four transforms: its systems are solved by conjugate gradients of their own
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from ..model import Palpation
 from .estimates import response
 from .observation import Nodes, Observation
-from .prior import AbstractPrior, cosine_transform, from_cosines
+from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
 from .transfer import wave_numbers
 
 _RTOL = 1e-3
@@ -32,7 +31,7 @@ class LayerNormal(eqx.Module):
     """
 
     prior: AbstractPrior
-    spacing: tuple[Array, Array]
+    spacing: Spacing
     gain: Nodes
     softness: Nodes
     precision: Nodes

@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_finite, check_positive
+from .._types import ScalarLike
 from .transfer import wave_numbers
 
 Nodes = Float[Array, "my mx"]
+Spacing = tuple[ScalarLike, ScalarLike]
 # How firmly a prior holds what it says nothing of, over what it holds: its standard deviation is as much larger.
 _HARDLY = 1e-3
 
@@ -33,11 +35,11 @@ class AbstractPrior(eqx.Module):
 
     mean: eqx.AbstractVar[Array | None]
 
-    def mode_std(self, k: Nodes, spacing: tuple[Array, Array]) -> Nodes:
+    def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
         """Compute the standard deviation of every orthonormal cosine mode [MPa]."""
         raise NotImplementedError
 
-    def scale(self, shape: tuple[int, int], spacing: tuple[Array, Array]) -> Nodes | Array:
+    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Nodes | Array:
         """Compute what nodal values are multiplied with after the cosine transform [-]."""
         raise NotImplementedError
 
@@ -45,13 +47,13 @@ class AbstractPrior(eqx.Module):
         """Tell how firmly the prior holds white unknowns near zero: 1, or `_HARDLY` where it says nothing."""
         return np.ones(shape)
 
-    def expand(self, white: Nodes, spacing: tuple[Array, Array]) -> Nodes:
+    def expand(self, white: Nodes, spacing: Spacing) -> Nodes:
         """Turn white unknowns into deviations from the mean [MPa]."""
         k = wave_numbers(white.shape, spacing)
         modes = self.mode_std(k, spacing) * white
         return self.scale(white.shape, spacing) * from_cosines(modes)
 
-    def whiten(self, deviation: Nodes, spacing: tuple[Array, Array]) -> Nodes:
+    def whiten(self, deviation: Nodes, spacing: Spacing) -> Nodes:
         """Turn deviations from the mean into white unknowns: the inverse of `expand`."""
         k = wave_numbers(deviation.shape, spacing)
         modes = cosine_transform(deviation / self.scale(deviation.shape, spacing))
@@ -90,7 +92,7 @@ class Matern(AbstractPrior):
         if self.mean is not None:
             check_finite("Matern.mean", "MPa", self.mean)
 
-    def mode_std(self, k: Nodes, spacing: tuple[Array, Array]) -> Nodes:
+    def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
         """Compute the standard deviation of every orthonormal cosine mode [MPa]."""
         k2 = (k * self.length) ** 2
         smooth = jnp.minimum(self.smoothness, 1e6)
@@ -100,7 +102,7 @@ class Matern(AbstractPrior):
         # The mean variance over the nodes is std².
         return self.std * jnp.sqrt(density * k.size / jnp.sum(density))
 
-    def scale(self, shape: tuple[int, int], spacing: tuple[Array, Array]) -> Nodes:
+    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Nodes:
         """Compute what nodal values are multiplied with, so that all have the same standard deviation [-]."""
         variance = self.mode_std(wave_numbers(shape, spacing), spacing) ** 2
         for axis in (0, 1):
@@ -134,14 +136,14 @@ class Tikhonov(AbstractPrior):
         if self.mean is not None:
             check_finite("Tikhonov.mean", "MPa", self.mean)
 
-    def mode_std(self, k: Nodes, spacing: tuple[Array, Array]) -> Nodes:
+    def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
         """Compute the standard deviation of every orthonormal cosine mode [MPa]; of the free one, a large number."""
         hx, hy = spacing
         lowest = jnp.min(jnp.where(k > 0, k, jnp.inf))
         unit = 1.0 / (self.weight * jnp.sqrt(hx * hy))
         return unit * jnp.where(k > 0, jnp.where(k > 0, k, 1.0) ** -float(self.order), lowest**-self.order)
 
-    def scale(self, shape: tuple[int, int], spacing: tuple[Array, Array]) -> Array:
+    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Array:
         """Compute what nodal values are multiplied with: 1."""
         return jnp.ones(())
 

@@ -9,6 +9,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._types import ScalarLike
 from ..model.material import AbstractMaterial
 
 Base = Literal["bonded", "slip"]
@@ -25,8 +26,12 @@ def poisson_ratio(material: AbstractMaterial) -> Array:
 
 
 def transfer_function(
-    k: Float[Array, "*modes"], thickness: Array, shear: Array, poisson: Array, base: Base
-) -> Float[Array, "*modes"]:
+    k: Float[Array, "*modes"],
+    thickness: ScalarLike,
+    shear: ScalarLike,
+    poisson: ScalarLike | Float[Array, "*ratios"],
+    base: Base,
+) -> Array:
     """Compute G(k) [mm/MPa], indentation per pressure.
 
     Args:
@@ -58,7 +63,7 @@ def transfer_function(
     return per_shear * thickness / shear
 
 
-def wave_numbers(shape: tuple[int, int], spacing: tuple[Array, Array]) -> Float[Array, "my mx"]:
+def wave_numbers(shape: tuple[int, int], spacing: tuple[ScalarLike, ScalarLike]) -> Float[Array, "my mx"]:
     """Compute the wave number [1/mm] of every mode of a two-dimensional cosine transform on nodes."""
     (my, mx), (hx, hy) = shape, spacing
     ky = jnp.pi * jnp.arange(my) / (my * hy)

@@ -26,9 +26,9 @@ from .tangent import Tangent, Unknowns
 _RTOL = 1e-10
 _MOST_CORRECTIONS = 12
 # Relative residual of each correction, in float32.
-_CORRECTION_RTOL = 1e-3
+_CORRECTION_RTOL = 1e-4
 # Relative residual of linear solves where the Jacobian is kept, in float32, and the largest that is accepted.
-_KEPT_RTOL = 1e-3
+_KEPT_RTOL = 3e-4
 _KEPT_MOST = 1e-2
 
 

@@ -111,8 +111,6 @@ def test_errors_say_what_to_do():
     thickness = op.ThicknessMap(np.full((11, 11), 0.45), extent=(SIDE, SIDE))
     with pytest.raises(ValueError, match="standard deviation"):
         op.fit_traction(palpation(), thickness, PRIOR)
-    with pytest.raises(ValueError, match="needs a prior"):
-        op.fit_traction(palpation(), thickness, None)
     bonded = op.Palpation(palpation().layer, (SIDE, SIDE), ELEMENTS, palpation().window, op.Bonded())
     with pytest.raises(ValueError, match=r"sample=Contact\(law, friction\), got sample=Bonded"):
         op.fit_traction(bonded, thickness, PRIOR)

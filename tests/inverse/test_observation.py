@@ -39,7 +39,8 @@ def test_a_cubic_surface_is_taken_over_exactly(mesh):
     x_node, y_node = mesh.plane()
     cubic = lambda x, y: 0.4 + 1e-3 * (x**3 - 2 * x**2 * y + 0.5 * y**3)  # noqa: E731
     seen = observe(mesh, measured(cubic(x, y)), 2e-3)
-    assert seen.surface == pytest.approx(np.asarray(cubic(x_node, y_node)), abs=1e-8)
+    # But for the splines' own slight stiffness, 1e-6 of the pixels'.
+    assert seen.surface == pytest.approx(np.asarray(cubic(x_node, y_node)), abs=1e-7)
     assert seen.representation_rms < 1e-8
     assert seen.informed == x_node.size
 
@@ -62,7 +63,8 @@ def test_a_masked_block_and_a_map_that_ends_early_leave_nodes_without_data(mesh)
     inside = 7 * 7  # nodes strictly within; splines of those next to the rim reach out
     assert seen.surface.size - inside <= seen.informed < seen.surface.size
     small = op.ThicknessMap(surface(x, y), extent=(2.5, 4.0), std=2e-3)
-    assert observe(mesh, small, 2e-3).informed < 0.6 * seen.surface.size
+    # 11 of 21 columns of nodes lie on it; splines of two more reach it.
+    assert 11 * 17 <= observe(mesh, small, 2e-3).informed <= 13 * 17
 
 
 def test_misfit_of_pure_noise_is_one_per_coefficient(mesh):
@@ -110,7 +112,7 @@ def test_interface_derivatives(mesh):
     _, slope = jax.jvp(lambda u: interface_heights(mesh, u), (u,), (change,))
     step = 1e-5
     difference = (interface_heights(mesh, u + step * change) - interface_heights(mesh, u - step * change)) / (2 * step)
-    assert slope == pytest.approx(difference, abs=1e-9)
+    assert slope == pytest.approx(np.asarray(difference), abs=1e-9)
     weights = jax.random.normal(jax.random.key(1), x.shape)
     _, pull = jax.vjp(lambda u: interface_heights(mesh, u), u)
     assert jnp.vdot(pull(weights)[0], change) == pytest.approx(float(jnp.vdot(weights, slope)), rel=1e-10)
@@ -126,5 +128,3 @@ def test_noise_must_be_known_and_positive():
         noise_std("fit_traction", op.ThicknessMap(values, extent=(1.0, 1.0)))
     with pytest.raises(ValueError, match=r"must be positive.*got 0"):
         noise_std("fit_traction", op.ThicknessMap(values, extent=(1.0, 1.0), std=0.0))
-    with pytest.raises(ValueError, match="all masked"):
-        noise_std("fit_traction", op.ThicknessMap(values, extent=(1.0, 1.0), std=1e-3, mask=np.ones((5, 5), bool)))

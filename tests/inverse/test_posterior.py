@@ -21,7 +21,7 @@ MATERIAL = op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=20 * 2 * (2.23e-3 + 7.
 def modes():
     """Gain [mm/MPa] and prior variance [MPa²] of the real Fourier modes."""
     k = 2 * np.pi / LENGTH * np.repeat(np.arange(POINTS // 2 + 1), 2)[1:-1]
-    gain = transfer_function(k, THICKNESS, MATERIAL.shear, poisson_ratio(MATERIAL), "bonded")
+    gain = transfer_function(jnp.asarray(k), THICKNESS, MATERIAL.shear, poisson_ratio(MATERIAL), "bonded")
     variance = (
         PRIOR_STD**2 * np.sqrt(2 * np.pi) * PRIOR_LENGTH * np.exp(-((k * PRIOR_LENGTH) ** 2) / 2) * POINTS / LENGTH
     )
