@@ -77,7 +77,7 @@ def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: Abstra
         prior: What is known of the pressure.
 
     Raises:
-        ValueError: If the map's std is missing or not positive, or the map does not touch the layer's field.
+        ValueError: If the map's std is missing or not positive.
     """
     mesh = palpation.mesh()
     observation = observe(mesh, thickness, noise_std("linear_estimate", thickness))

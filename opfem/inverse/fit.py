@@ -11,6 +11,7 @@ from ..measurement import ThicknessMap
 from ..model import Contact, Palpation, Traction
 from ..solvers import Newton, solve
 from ..solvers.progress import FitProgress
+from ..solvers.solve import require_float64
 from .estimates import solve_linear
 from .forward import press
 from .gauss_newton import GaussNewton, PreconditionedDescent
@@ -101,6 +102,7 @@ def fit_traction(
             below the mesh, or numbers are float32.
         RuntimeError: If the fit fails and `throw` is True.
     """
+    require_float64(palpation)
     _check(palpation, prior)
     mesh = palpation.mesh()
     std = noise_std("fit_traction", thickness)
@@ -111,6 +113,8 @@ def fit_traction(
     descent = PreconditionedDescent(precondition, jnp.asarray(_CG_RTOL), jnp.asarray(_CG_STEPS))
     gauss_newton = GaussNewton(jnp.asarray(rtol), jnp.asarray(rtol), descent)
     white, state, aux, steps, result = _iterate(gauss_newton, white, misfit, max_steps, progress)
+    if throw and bool(result != FitStatus.successful):
+        raise RuntimeError(f"The fit stopped after {steps} forward solves. {FitStatus[result]}")
 
     posterior = Posterior(white, state.f_info.jac, descent.precondition)
     key = jax.random.key(0) if key is None else key
@@ -133,7 +137,7 @@ def fit_traction(
         "representation_rms": observation.representation_rms,
         "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
     }
-    fit = TractionFit(
+    return TractionFit(
         solution=solution,
         pressure_std=normal_std * solution.pressure / -solution.traction[2],
         normal_std=normal_std,
@@ -147,9 +151,6 @@ def fit_traction(
         prior=prior,
         deviations=deviations,
     )
-    if throw and bool(result != FitStatus.successful):
-        raise RuntimeError(f"The fit stopped after {steps} forward solves. {FitStatus[result]}")
-    return fit
 
 
 def _iterate(gauss_newton, white, misfit: Misfit, max_steps: int, progress: bool):

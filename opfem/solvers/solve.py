@@ -49,7 +49,7 @@ def solve(
         ValueError: If load and palpation contradict each other, or numbers are float32.
         ConvergenceError: If the solve fails and `throw` is True.
     """
-    _require_float64(palpation)
+    require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
@@ -166,7 +166,8 @@ def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
     return solution
 
 
-def _require_float64(palpation: Palpation) -> None:
+def require_float64(palpation: Palpation) -> None:
+    """Raise ValueError where numbers are float32."""
     dtypes = {leaf.dtype for leaf in jax.tree.leaves(palpation) if eqx.is_inexact_array(leaf)}
     if jnp.dtype("float32") in dtypes:
         raise ValueError(
