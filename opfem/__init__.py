@@ -9,16 +9,25 @@ from typing import Any
 from . import datasets as datasets
 from .compilation import cache_compilation as cache_compilation
 from .inverse import (
+    AxialDisplacement as AxialDisplacement,
+    FitError as FitError,
     FitStatus as FitStatus,
+    ForceReading as ForceReading,
     LinearEstimate as LinearEstimate,
+    LogNormal as LogNormal,
     Matern as Matern,
+    Normal as Normal,
     Tikhonov as Tikhonov,
+    TotalVariation as TotalVariation,
     TractionFit as TractionFit,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,
+    mesh_error as mesh_error,
+    refitted as refitted,
     uniaxial_estimate as uniaxial_estimate,
 )
 from .io import (
+    Checkpoint as Checkpoint,
     read_netcdf as read_netcdf,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
@@ -50,12 +59,31 @@ from .results import layer_fields as layer_fields, summary as summary, to_xarray
 from .solvers import (
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,
+    Explicit as Explicit,
     Newton as Newton,
     Solution as Solution,
     solve as solve,
 )
+from .sweep import (
+    Batch as Batch,
+    Cluster as Cluster,
+    Devices as Devices,
+    sample as sample,
+    sweep as sweep,
+    value_and_sensitivities as value_and_sensitivities,
+    zip_ as zip_,
+)
 
-_PICTURES = ("plot_layer", "plot_pressure", "plot_report", "plot_residual", "plot_status", "plot_thickness")
+_PICTURES = (
+    "plot_fit",
+    "plot_layer",
+    "plot_pressure",
+    "plot_report",
+    "plot_residual",
+    "plot_status",
+    "plot_thickness",
+    "plot_uncertainty",
+)
 
 
 def __getattr__(name: str) -> Any:

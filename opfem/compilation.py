@@ -5,6 +5,7 @@ import os
 import platform
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
@@ -38,6 +39,22 @@ def cache_compilation(folder: str | os.PathLike | None = None) -> Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
     compilation_cache.reset_cache()  # else what was compiled before this call would have settled that there is none
     return own
+
+
+# What a process that computes for another must share with it.
+_SHARED = ("jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+
+
+def configuration() -> dict[str, Any]:
+    """Return how JAX is configured here, for `configure` in another process."""
+    return {name: getattr(jax.config, name) for name in _SHARED}
+
+
+def configure(settings: dict[str, Any]) -> None:
+    """Configure JAX as another process has it."""
+    for name, value in settings.items():
+        if getattr(jax.config, name) != value:
+            jax.config.update(name, value)
 
 
 def _processor() -> str:

@@ -10,7 +10,26 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 # What each prints, as patterns.
 PRINTED = {
+    "explicit": [
+        r"explicit: force 0\.\d+ N",
+        r"pressure inside: difference 0\.\d\d%",
+        r"kinetic 0\.\d\d%, missing 0\.\d+%",
+    ],
     "stress_map": [r"force 0\.\d+ N", r"C10: [+-]\d\.\d\d % per %"],
+    "traction_fit": [
+        r"chi2 per degree of freedom (0\.[89]|1\.[012])",
+        r"fit: error ([0-9]|1\d|2[0-4])\.\d% of the variation, \d\.\d% of the pressure",
+        r"imprint: error",
+        r"uniaxial: error",
+        r"(8[5-9]|9\d)% of points inside",
+    ],
+    "sweep": [
+        r"ended as: (slides_off )?successful",
+        r"friction changes the largest pressure by [+-]\d+\.\d%",
+        r"224 points, 0 failed",
+        r"l0 +first order [+-]\d\.\d\d, total \d\.\d\d",
+        r"largest influence: \w+",
+    ],
     "verification": [
         r"uniform compression: largest difference \d\.\de-(0[7-9]|1\d)",
         r"without friction: difference \d\.\de-(0[7-9]|1\d)",
@@ -19,10 +38,10 @@ PRINTED = {
         r"hard contact: penetration \de-0[5-9] µm",
     ],
 }
-SLOW = {"verification": pytest.mark.slow}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in PRINTED])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRINTED)
 def test_notebook_runs(name, tmp_path):
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     assert all(not cell.get("outputs") for cell in notebook.cells), "commit notebooks without outputs"

@@ -28,12 +28,35 @@ def own_map(tmp_path, monkeypatch):
 
 
 def test_python(own_map):
-    (code,) = blocks("python")
+    code, _, swept = blocks("python")
     names = {}
     exec(compile(code, "README.md", "exec"), names)
     assert 0 < float(names["data"].pressure.mean()) < 0.1
+    exec(compile(swept, "README.md", "exec"), names)
+    assert names["table"].max_pressure.dims == ("c10", "friction")
+    assert names["table"].max_pressure.notnull().all()
     assert plt.gcf().axes
     plt.close("all")
+
+
+@pytest.mark.slow
+def test_fit(own_map):
+    code, fitted, _ = blocks("python")
+    names = {}
+    exec(compile(code + fitted, "README.md", "exec"), names)
+    assert bool(names["fit"].result == op.FitStatus.successful)
+    plt.close("all")
+
+
+def test_sweep_file(own_map, tmp_path):
+    (config,) = blocks("toml")
+    Path("sweep.toml").write_text(config, encoding="utf-8")
+    with pytest.raises(SystemExit) as end:
+        main(["sweep", "sweep.toml", "--out", "swept"])
+    assert end.value.code in (0, None)
+    data = op.read_netcdf(tmp_path / "swept" / "result.nc")
+    assert data.sizes["c10"] == data.sizes["window_friction"] == 2
+    assert data.max_pressure.notnull().all()
 
 
 def test_commands(own_map, tmp_path):

@@ -1,6 +1,7 @@
 """Options of the command line, in the groups that its help shows."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
@@ -76,12 +77,54 @@ class ContactOptions:
     ] = False
 
 
-@Parameter(name="*", group=Group("Run", sort_key=4))
+@Parameter(name="*", group=Group("Fit", sort_key=4))
+@dataclass(frozen=True)
+class FitOptions:
+    """What is known of the pressure before the map, and what is asked of the fit."""
+
+    prior_length: Annotated[
+        float | None, Parameter(help="Correlation length of the pressure in mm. Default: three elements.")
+    ] = None
+    prior_std: Annotated[
+        float | None,
+        Parameter(help="Standard deviation of the pressure in MPa. Default: that of the uniaxial estimate."),
+    ] = None
+    prior_mean: Annotated[
+        float | None, Parameter(help="Mean of the pressure in MPa. Default: that of the uniaxial estimate.")
+    ] = None
+    hyperparameters: Annotated[
+        Literal["given", "discrepancy", "evidence"],
+        Parameter(help="Take length and std as given, std by the discrepancy principle, or both as most likely."),
+    ] = "given"
+    nonnegative: Annotated[bool, Parameter(help="Keep the pressure above zero.")] = False
+    friction_spread: Annotated[
+        float | None,
+        Parameter(help="Relative uncertainty of both frictions, fitted as well and allowed for. Default: none."),
+    ] = None
+    modulus_spread: Annotated[
+        float | None,
+        Parameter(help="Relative uncertainty of C10, fitted as well and allowed for. Default: none."),
+    ] = None
+    draws: Annotated[int, Parameter(help="Draws of the posterior that standard deviations come from.")] = 16
+
+
+@Parameter(name="*", group=Group("Run", sort_key=5))
 @dataclass(frozen=True)
 class RunOptions:
     """The run itself."""
 
-    increments: Annotated[int | None, Parameter(help="Load increments. Default: the solver's own.")] = None
+    solver: Annotated[
+        Literal["newton", "explicit"], Parameter(help="Implicit statics, or explicit dynamics as published.")
+    ] = "newton"
+    increments: Annotated[int | None, Parameter(help="Load increments of newton. Default: the solver's own.")] = None
+    duration: Annotated[float | None, Parameter(help="Duration of explicit in s. Default: the published 1 s.")] = None
+    mass_scaling: Annotated[float | None, Parameter(help="Mass scaling of explicit. Default: the published 25.")] = None
+    precision: Annotated[
+        Literal["float32", "float64"], Parameter(help="Precision of explicit; float32 takes half the time.")
+    ] = "float64"
+    checkpoint: Annotated[
+        Path | None, Parameter(help="File (.npz) that keeps the state of explicit, from which a killed run goes on.")
+    ] = None
     force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
     keep_compiled: Annotated[
         bool, Parameter(help="Keep what is compiled on disk: later runs of the same mesh need not compile.")

@@ -1,57 +1,184 @@
-"""`fit_traction`: the traction that explains a measured map, with its uncertainty (route B)."""
+"""`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._checks import concrete
+from .._types import ScalarLike
 from ..measurement import ThicknessMap
-from ..model import Contact, Palpation, Traction
-from ..solvers import Newton, solve
+from ..model import Contact, Palpation
+from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
+from .data import AxialDisplacement, ForceReading
 from .estimates import solve_linear
-from .forward import press
 from .gauss_newton import GaussNewton, PreconditionedDescent
+from .hyperparameters import most_likely, rescaled
+from .misfit import Misfit, moved, pressure_change
 from .noise import noise_std
-from .observation import Nodes, Observation, interface_heights, observe
+from .observation import observe
+from .parameters import AbstractNumberPrior, check_parameters
 from .posterior import Posterior
-from .preconditioner import layer_normal
+from .preconditioner import Unknowns, fit_normal
 from .prior import AbstractPrior, Matern, on_nodes
-from .result import FitStatus, TractionFit
+from .resolution import resolution
+from .result import FitError, FitStatus, TractionFit
 
+Choice = Literal["given", "discrepancy", "evidence"]
 # Relative gradient of each Gauss–Newton system, and most iterations.
 _CG_RTOL = 1e-2
 _CG_STEPS = 60
-# Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then halved.
-_NOT_CARRIED = 1e4
+# A non-negative pressure bends towards zero below this part of the shear modulus.
+_SOFTNESS = 0.05
+# Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
+_MOST_CHOICES = 8
+_CHOSEN = 0.05
 
 
-class Misfit(eqx.Module):
-    """What a fit minimises, as a function of white unknowns."""
+def fit_traction(
+    palpation: Palpation,
+    thickness: ThicknessMap | Sequence[ThicknessMap],
+    prior: AbstractPrior,
+    *,
+    parameters: Mapping[str, AbstractNumberPrior] | None = None,
+    forces: ForceReading | Sequence[ForceReading] | None = None,
+    inside: AxialDisplacement | Sequence[AxialDisplacement] | None = None,
+    lateral: AbstractPrior | None = None,
+    nonnegative: bool = False,
+    model_std: ScalarLike = 0.0,
+    hyperparameters: Choice = "given",
+    solver: Newton = Newton(max_path=12),
+    rtol: float = 1e-3,
+    max_steps: int = 30,
+    draws: int = 16,
+    key: PRNGKeyArray | None = None,
+    throw: bool = True,
+    progress: bool = True,
+) -> TractionFit:
+    """Find the traction on the interface that explains measured maps.
 
-    palpation: Palpation
-    observation: Observation
-    prior: AbstractPrior
-    solver: Newton
+    Least squares over misfit and priors, by Gauss–Newton through the nonlinear solve with its friction history. The
+    normal traction is fitted; the lateral one follows the sample's friction (`Traction`) unless `lateral` is given.
 
-    def normal(self, white: Nodes) -> Nodes:
-        """Compute the normal traction [MPa] per reference area."""
-        return on_nodes(self.prior, white.shape) + self.prior.expand(white, self.palpation.mesh().spacing)
+    Args:
+        palpation: The experiment; its sample a `Contact`, its elements hexahedra.
+        thickness: The measured map under load, with its `std`; masked pixels count for nothing. A sequence of maps
+            on one pixel grid, each under another load from zero: each has its own traction, fitted numbers are shared.
+        prior: What is known of the normal traction: `Matern`, `Tikhonov` or `TotalVariation`.
+        parameters: Numbers of the experiment to fit as well, and what is known of them: by path, such as
+            {"window.friction": LogNormal(0.15, 0.5)}, or "refractive_index" [-] (over the one that both maps were
+            scaled with) and "l0_offset" [mm]. With a narrow prior: an uncertainty to allow for.
+        forces: Reading of the total force under each map.
+        inside: Displacements inside the layer under each map.
+        lateral: Prior of each component of the lateral traction, then fitted as well. A thickness map says little of
+            it: see `TractionFit.informed`.
+        nonnegative: Keep the pressure above zero.
+        model_std: Standard deviation of the computed height [mm], independent from element to element: what the mesh
+            misses, above all. Pixels are many, so that without it a coarse mesh is believed more than it deserves; a
+            solve of the fit's traction on half the mesh tells how much it is (`mesh_error`).
+        hyperparameters: "given": the prior as it is. "discrepancy": its standard deviation (or weight) so that χ² of
+            the map is what its noise makes it, the strongest prior that the data allow. "evidence": standard deviation
+            and length so that the data are most likely (Laplace).
+        solver: Settings of the forward solve; `max_path` bounds its increments.
+        rtol: The fit has settled where a step changes unknowns and residuals by less [-].
+        max_steps: Most evaluations of the forward solve.
+        draws: Draws of the posterior that standard deviations come from.
+        key: Random key of the draws; None: always the same.
+        throw: Raise where the fit fails. False: return what was reached, with its status.
+        progress: Show a bar on a terminal or in a notebook.
 
-    def __call__(self, white: Nodes) -> tuple[tuple[Array, Array], dict[str, Array]]:
-        """Compute standardised misfit and what the prior holds near zero [-]; and how the solve went."""
-        interface = press(self.palpation, Traction(self.normal(white)), self.solver)
-        heights = interface_heights(self.palpation.mesh(), interface.u)
-        carried = interface.reached >= 1.0
-        misfit = jnp.where(carried, self.observation.misfit(heights), _NOT_CARRIED)
-        aux = {"carried": carried, "heights": heights, "newton": interface.newton}
-        return (misfit, jnp.asarray(self.prior.penalised(white.shape)) * white), aux
+    Raises:
+        ValueError: If the sample is no `Contact`, a map's std is missing or not positive, no pixel of a map lies on
+            the layer, the prior's length is below the mesh, a parameter is unknown, or numbers are float32.
+        FitError: If the fit fails and `throw` is True.
+    """
+    require_float64(palpation)
+    parameters = dict(parameters or {})
+    maps = _as_tuple(thickness)
+    _check(palpation, maps, prior, lateral, parameters)
+    several = not isinstance(thickness, ThicknessMap)
+    seen = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
+    observations = seen(palpation.mesh(), *_stacked_maps(maps), jnp.asarray(model_std, float))
+    _check_covered(maps, observations)
+    misfit = Misfit(
+        palpation=palpation,
+        observations=observations,
+        prior=prior,
+        lateral=lateral,
+        parameters=parameters,
+        forces=_stacked("forces", forces, len(maps)),
+        inside=_stacked("inside", inside, len(maps)),
+        softness=_SOFTNESS * palpation.layer.material.shear if nonnegative else None,
+        solver=solver.as_leaves(),
+    )
+    key = jax.random.key(0) if key is None else key
+    with FitProgress(progress) as bar:
+        run = _Run(misfit, rtol, max_steps, bar)
+        reached = run.fit(_linear_start(misfit))
+        if bool(reached.result == FitStatus.successful) and hyperparameters != "given":
+            misfit, reached = _choose(run, reached, hyperparameters, draws, key)
+        if throw and bool(reached.result != FitStatus.successful):
+            raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
+        return _result(misfit, reached, run, several, draws, key, bar)
 
 
-def _misfit(white: Nodes, misfit: Misfit):
+class _Reached(NamedTuple):
+    """Where a fit ended."""
+
+    white: Unknowns
+    residuals: dict[str, Any]
+    aux: dict[str, Array]
+    posterior: Posterior
+    result: FitStatus
+
+
+class _Run:
+    """A fit in progress: what it fits, and what it has spent."""
+
+    def __init__(self, misfit: Misfit, rtol: float, max_steps: int, bar: FitProgress):
+        self.misfit, self.rtol, self.max_steps, self.bar = misfit, rtol, max_steps, bar
+        self.solves, self.iterations, self.steps = 0, 0, 0
+
+    def fit(self, white: Unknowns) -> _Reached:
+        """Go on from unknowns until the fit settles or fails."""
+        misfit = self.misfit
+        descent = PreconditionedDescent(
+            fit_normal(misfit.palpation, misfit.observations, misfit.prior),
+            jnp.asarray(_CG_RTOL),
+            jnp.asarray(_CG_STEPS),
+        )
+        gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
+        structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
+        state = gauss_newton.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
+        result, aux = FitStatus.max_steps_reached, None
+        for _ in range(self.max_steps):
+            white, state, aux, done = _step(gauss_newton, white, misfit, state)
+            self.solves += 1
+            loss, inner = float(state.f_info.as_min()), int(state.descent_state.iterations)
+            self.bar.show(self.solves, loss, self.iterations + inner)
+            if not bool(jnp.all(aux["carried"])):
+                result = FitStatus.not_carried
+                break
+            if not np.isfinite(loss) or not all(bool(jnp.all(jnp.isfinite(v))) for v in jax.tree.leaves(state.y_eval)):
+                result = FitStatus.nonfinite
+                break
+            if bool(done):
+                result = FitStatus.successful
+                break
+        self.iterations += int(state.descent_state.iterations)
+        self.steps += int(state.num_accepted_steps)
+        J = state.f_info.jac
+        posterior = Posterior(white, J, eqx.filter_jit(descent.precondition)(J))
+        return _Reached(white, state.f_info.residual, aux, posterior, result)
+
+
+def _misfit(white: Unknowns, misfit: Misfit):
     return misfit(white)
 
 
@@ -62,128 +189,191 @@ def _step(solver, white, misfit, state):
     return white, state, aux, done
 
 
+def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):
+    """Draw deviations of the unknowns, of normal tractions [MPa] and of the interface [mm]; their share of the data."""
+    white, residuals, iterations = posterior.draw(key)
+    _, normal = jax.jvp(misfit.normal, (posterior.white,), (white,))
+    return white, normal, moved(residuals), jnp.sum(residuals["maps"] ** 2), iterations
+
+
 @eqx.filter_jit
-def _posterior_draw(posterior: Posterior, key):
-    return posterior.draw(key)
+def _linear_start(misfit: Misfit) -> Unknowns:
+    """Start where small-strain elasticity of a flat layer ends."""
+    spacing, prior = misfit.palpation.mesh().spacing, misfit.prior
+
+    def one(observation):
+        white = solve_linear(misfit.palpation, observation, prior).x
+        return on_nodes(prior, white.shape) + prior.expand(white, spacing)
+
+    return misfit.white(jax.vmap(one)(misfit.observations))
 
 
-def fit_traction(
-    palpation: Palpation,
-    thickness: ThicknessMap,
-    prior: AbstractPrior,
-    *,
-    solver: Newton = Newton(max_path=12),
-    rtol: float = 1e-3,
-    max_steps: int = 30,
-    draws: int = 32,
-    key: PRNGKeyArray | None = None,
-    throw: bool = True,
-    progress: bool = True,
+def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyArray) -> tuple[Misfit, _Reached]:
+    """Fit again under other hyper-parameters, each fit from the last, until they settle."""
+    low, high = -np.inf, np.inf  # logarithms of factors on the standard deviation that are too small, too large
+    factor = 0.0
+    for _ in range(_MOST_CHOICES):
+        misfit, prior = run.misfit, run.misfit.prior
+        normal = misfit.normal(reached.white)
+        if how == "evidence":
+            around = [_draw(reached.posterior, misfit, one)[1] for one in jax.random.split(key, draws)]
+            mean = on_nodes(prior, normal.shape[1:])
+            chosen, change = most_likely(prior, (normal + jnp.stack(around) - mean).reshape(-1, *mean.shape), misfit)
+        else:
+            reduced = float(jnp.sum(reached.residuals["maps"] ** 2) / jnp.sum(misfit.observations.informed))
+            low, high = (factor, high) if reduced > 1.0 else (low, factor)
+            step = np.log(2.0) if np.isinf(high - low) else 0.5 * (high - low)
+            target = (low + step) if np.isfinite(low) else (high - step)
+            change, chosen, factor = abs(target - factor), rescaled(prior, np.exp(target - factor)), target
+        run.misfit = eqx.tree_at(lambda m: m.prior, misfit, chosen)
+        reached = run.fit(
+            run.misfit.white(normal)._replace(numbers=reached.white.numbers, lateral=reached.white.lateral)
+        )
+        if change < _CHOSEN or bool(reached.result != FitStatus.successful):
+            break
+    return run.misfit, reached
+
+
+def _result(
+    misfit: Misfit, reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: FitProgress
 ) -> TractionFit:
-    """Find the traction on the interface that explains a measured map.
-
-    Least squares over misfit and prior, by Gauss–Newton through the nonlinear solve with its friction history. The
-    normal traction is fitted; the lateral one follows the sample's friction (`Traction`).
-
-    Args:
-        palpation: The experiment; its sample a `Contact`.
-        thickness: The measured map under load, with its `std`; masked pixels count for nothing.
-        prior: What is known of the normal traction: `Matern` or `Tikhonov`.
-        solver: Settings of the forward solve; `max_path` bounds its increments.
-        rtol: The fit has settled where a step changes unknowns and residuals by less [-].
-        max_steps: Most evaluations of the forward solve.
-        draws: Draws of the posterior that standard deviations come from.
-        key: Random key of the draws; None: always the same.
-        throw: Raise where the fit fails. False: return what was reached, with its status.
-        progress: Show a bar on a terminal or in a notebook.
-
-    Raises:
-        ValueError: If the sample is no `Contact`, the map's std is missing or not positive, the prior's length is
-            below the mesh, or numbers are float32.
-        RuntimeError: If the fit fails and `throw` is True.
-    """
-    require_float64(palpation)
-    _check(palpation, prior)
-    mesh = palpation.mesh()
-    std = noise_std("fit_traction", thickness)
-    observation = eqx.filter_jit(observe)(mesh, thickness, std)
-    misfit = Misfit(palpation, observation, prior, solver.as_leaves())
-    white = eqx.filter_jit(solve_linear)(palpation, observation, prior).x
-    precondition = layer_normal(palpation, observation, prior)
-    descent = PreconditionedDescent(precondition, jnp.asarray(_CG_RTOL), jnp.asarray(_CG_STEPS))
-    gauss_newton = GaussNewton(jnp.asarray(rtol), jnp.asarray(rtol), descent)
-    white, state, aux, steps, result = _iterate(gauss_newton, white, misfit, max_steps, progress)
-    if throw and bool(result != FitStatus.successful):
-        raise RuntimeError(f"The fit stopped after {steps} forward solves. {FitStatus[result]}")
-
-    posterior = Posterior(white, state.f_info.jac, descent.precondition)
-    key = jax.random.key(0) if key is None else key
-    solution = solve(palpation, Traction(misfit.normal(white)), solver, throw=False, progress=False)
-    deviations, dof, iterations = [], [], 0
-    for one in jax.random.split(key, draws):
-        deviation, determined, count = _posterior_draw(posterior, one)
-        deviations.append(prior.expand(deviation, mesh.spacing))
+    palpation, loads = misfit.experiment(reached.white), misfit.tractions(reached.white)
+    solutions = [
+        solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
+        for i in range(loads.normal.shape[0])
+    ]
+    deviations, moves, whites, dof, iterations = [], [], [], [], 0
+    for count, one in enumerate(jax.random.split(key, draws)):
+        white, normal, move, determined, steps = _draw(reached.posterior, misfit, one)
+        deviations.append(normal)
+        moves.append(move)
+        whites.append(white)
         dof.append(determined)
-        iterations += int(count)
+        iterations += int(steps)
+        bar.drawn(count + 1, draws)
     deviations = jnp.stack(deviations)
-    normal_std = jnp.sqrt(jnp.mean(deviations**2, axis=0))
-    residual = aux["heights"] - observation.surface
-    stats = {
-        "forward_solves": steps,
-        "inner_iterations": int(state.descent_state.iterations),
-        "posterior_iterations": iterations,
-        "draws": draws,
-        "std_error": 1.0 / (2.0 * draws) ** 0.5,
-        "representation_rms": observation.representation_rms,
-        "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
-    }
+    pressures = _pressure_deviations(palpation, solutions, deviations, jnp.stack(moves))
+    residual = reached.aux["heights"] - misfit.observations.surface
+    points, widths = resolution(reached.posterior, misfit)
+    numbers = {name: jnp.stack([white.numbers[name] for white in whites]) for name in misfit.parameters}
+    solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
+
+    def one_or_all(v):
+        return v if several else jax.tree.map(lambda leaf: leaf[0], v)
+
     return TractionFit(
-        solution=solution,
-        pressure_std=normal_std * solution.pressure / -solution.traction[2],
-        normal_std=normal_std,
-        chi2=jnp.sum(state.f_info.residual[0] ** 2),
+        solution=one_or_all(solution),
+        pressure_std=one_or_all(_rms(pressures)),
+        normal_std=one_or_all(_rms(deviations)),
+        chi2=jnp.sum(reached.residuals["maps"] ** 2),
         effective_dof=jnp.mean(jnp.stack(dof)),
-        observed=observation.informed,
-        residual=residual,
-        stats=stats,
-        result=result,
-        posterior=posterior,
-        prior=prior,
-        deviations=deviations,
+        observed=jnp.sum(misfit.observations.informed),
+        residual=one_or_all(residual),
+        resolution_points=points,
+        resolution_width=one_or_all(widths),
+        deviations=deviations if several else deviations[:, 0],
+        number_deviations=numbers,
+        misfit=misfit,
+        posterior=reached.posterior,
+        stats={
+            "forward_solves": run.solves,
+            "gauss_newton_steps": run.steps,
+            "inner_iterations": run.iterations,
+            "posterior_iterations": iterations,
+            "draws": draws,
+            "std_error": 1.0 / (2.0 * draws) ** 0.5,
+            "representation_rms": jnp.sqrt(jnp.mean(misfit.observations.representation_rms**2)),
+            "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
+        },
+        result=reached.result,
     )
 
 
-def _iterate(gauss_newton, white, misfit: Misfit, max_steps: int, progress: bool):
-    structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
-    state = gauss_newton.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
-    with FitProgress(progress) as bar:
-        for step in range(1, max_steps + 1):
-            white, state, aux, done = _step(gauss_newton, white, misfit, state)
-            loss = float(state.f_info.as_min())
-            bar.show(step, loss, int(state.descent_state.iterations))
-            if not bool(aux["carried"]):
-                return white, state, aux, step, FitStatus.not_carried
-            if not jnp.isfinite(loss) or not bool(jnp.all(jnp.isfinite(state.y_eval))):
-                return white, state, aux, step, FitStatus.nonfinite
-            if bool(done):
-                return white, state, aux, step, FitStatus.successful
-    return white, state, aux, max_steps, FitStatus.max_steps_reached
+def _pressure_deviations(
+    palpation: Palpation,
+    solutions: list[Solution],
+    deviations: Float[Array, "draws maps my mx"],
+    moves: Float[Array, "draws maps 3 my mx"],
+) -> Float[Array, "draws maps my mx"]:
+    """Turn deviations of the normal traction into those of the pressure on the current area [MPa]."""
+
+    def of_map(i, solution):
+        def one(change, move):
+            return pressure_change(palpation, solution.traction, solution.displacement[:, -1], change, move)
+
+        return jax.vmap(one)(deviations[:, i], moves[:, i])
+
+    return jnp.stack([of_map(i, solution) for i, solution in enumerate(solutions)], axis=1)
 
 
-def _check(palpation: Palpation, prior: AbstractPrior) -> None:
+def _rms(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:
+    return jnp.sqrt(jnp.mean(deviations**2, axis=0))
+
+
+def _as_tuple(value: Any) -> tuple:
+    return tuple(value) if isinstance(value, Sequence) else (value,)
+
+
+def _stacked(name: str, value: Any, maps: int) -> Any:
+    """Stack what is given for each map."""
+    if value is None:
+        return None
+    each = _as_tuple(value)
+    if len(each) != maps:
+        raise ValueError(f"fit_traction.{name} needs one for each of {maps} maps, got {len(each)}.")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def _stacked_maps(maps: tuple[ThicknessMap, ...]) -> tuple[ThicknessMap, Array]:
+    """Stack maps, and their noise."""
+    plain = [ThicknessMap(m.values, m.extent, None, m.origin, None, m.mask, noise_length=m.noise_length) for m in maps]
+    std = [jnp.broadcast_to(noise_std("fit_traction", m), m.shape) for m in maps]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain), jnp.stack(std)
+
+
+def _check(
+    palpation: Palpation, maps: tuple[ThicknessMap, ...], prior: Any, lateral: Any, parameters: Mapping[str, Any]
+) -> None:
     if not isinstance(palpation.sample, Contact):
         raise ValueError(
             f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
         )
-    if not isinstance(prior, AbstractPrior):
-        raise ValueError(f"fit_traction.prior must be Matern(...) or Tikhonov(...), got {type(prior).__name__}.")
+    if palpation.element in ("tet4", "tet10"):
+        raise ValueError(f"fit_traction needs hexahedra, such as element='mean_dilatation', got {palpation.element!r}.")
+    for m in maps:
+        noise_std("fit_traction", m)
+    if not maps or len({m.shape for m in maps}) > 1:
+        raise ValueError(
+            f"fit_traction.thickness must be one map, or several on one grid of pixels, got shapes "
+            f"{[m.shape for m in maps]}."
+        )
+    check_parameters(palpation, parameters)
     nx, ny, _ = palpation.elements
     if min(nx, ny) < 4:
         raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
-    length = concrete(prior.length) if isinstance(prior, Matern) else None
-    size = concrete(jnp.stack(palpation.mesh().spacing).max())
-    if length is not None and size is not None and np.any(length < size):
-        raise ValueError(
-            f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh cannot "
-            "follow it. Pass a longer length, or Palpation(elements=...) with more."
-        )
+    for name, one in (("prior", prior), ("lateral", lateral)):
+        if one is None and name == "lateral":
+            continue
+        if not isinstance(one, AbstractPrior):
+            raise ValueError(
+                f"fit_traction.{name} must be Matern(...), Tikhonov(...) or TotalVariation(...), got "
+                f"{type(one).__name__}."
+            )
+        length = concrete(one.length) if isinstance(one, Matern) else None
+        size = concrete(jnp.stack(palpation.mesh().spacing).max())
+        if length is not None and size is not None and np.any(length < size):
+            raise ValueError(
+                f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh "
+                "cannot follow it. Pass a longer length, or Palpation(elements=...) with more."
+            )
+
+
+def _check_covered(maps: tuple[ThicknessMap, ...], observations: Any) -> None:
+    for number, (m, informed) in enumerate(zip(maps, np.asarray(observations.informed), strict=True)):
+        if informed == 0:
+            raise ValueError(
+                f"fit_traction: map {number} has no pixel with data on the layer, which covers 0 to its extent [mm]; "
+                f"the map starts at (x, y) = {np.asarray(m.origin).tolist()} and ends at "
+                f"{np.asarray(m.origin + m.extent).tolist()} mm, {float(np.mean(m.mask)):.0%} of it masked. "
+                "Pass ThicknessMap(origin=...) that matches, or unmask pixels."
+            )

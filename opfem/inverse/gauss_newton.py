@@ -17,39 +17,43 @@ _NEGLIGIBLE = 0.03
 
 
 class LeastSquares(NamedTuple):
-    """Solution of a linear least-squares problem, its relative gradient and iterations."""
+    """Solution of a linear least-squares problem, what it leaves of b, its relative gradient, and iterations."""
 
-    x: Array
+    x: PyTree
+    rest: PyTree
     relative_gradient: Array
     iterations: Array
 
 
 def least_squares(
-    jacobian: Callable[[Array], PyTree],
-    transpose: Callable[[PyTree], Array],
-    precondition: Callable[[Array], Array],
+    jacobian: Callable[[PyTree], PyTree],
+    transpose: Callable[[PyTree], PyTree],
+    precondition: Callable[[PyTree], PyTree],
     b: PyTree,
     rtol: float | Array,
     most: int | Array,
     negligible: float | Array = 0.0,
+    gradient: PyTree | None = None,
 ) -> LeastSquares:
-    """Minimise |J x - b|² by conjugate gradients on the normal equations.
+    """Minimise |J x - b|² / 2 - gradient · x by conjugate gradients on the normal equations.
 
     Args:
         jacobian: Multiply with J.
         transpose: Multiply with its transpose.
         precondition: Approximate inverse of JᵀJ, symmetric positive; only nearly linear is enough.
         b: What J x is to match.
-        rtol: Relative tolerance of the gradient Jᵀ(b - J x), in the preconditioner's norm.
+        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + gradient, in the preconditioner's norm.
         most: Most iterations.
         negligible: Enough is also a gradient of this norm: the length of what is left to go, measured by J.
+        gradient: What to add to the right-hand side Jᵀb; None: nothing.
 
     Source:
         Björck, Numerical Methods for Least Squares Problems, algorithm 7.4.1 (CGLS), preconditioned;
         Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear.
     """
     like = jax.eval_shape(transpose, b)
-    zero, none = jnp.zeros(like.shape, like.dtype), jnp.zeros((), int)
+    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
+    zero, none = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like))), jnp.zeros((), int)
 
     def unfinished(carry):
         *_, size, first, count = carry
@@ -57,20 +61,32 @@ def least_squares(
 
     # The first pass only finds the gradient: so each product appears, and is compiled, once.
     def iterate(carry):
-        x, rest, gradient, p, size, first, count = carry
+        x, rest, before, p, size, first, count = carry
         q = jacobian(p)
-        squared = sum(jnp.vdot(part, part) for part in jax.tree.leaves(q))
+        squared = dot(q, q)
         step = jnp.where(squared > 0, size / jnp.where(squared > 0, squared, 1.0), 0.0)
-        x, rest = x + step * p, jax.tree.map(lambda r, part: r - step * part, rest, q)
-        before, gradient = gradient, transpose(rest)
-        z = precondition(gradient)
-        new, change = jnp.vdot(gradient, z), jnp.vdot(gradient - before, z)
-        p = z + jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0) * p
-        return x, rest, gradient, p, new, jnp.where(count == 0, new, first), count + 1
+        x, rest = plus(x, p, step), plus(rest, q, -step)
+        now = transpose(rest)
+        now = now if gradient is None else plus(now, gradient)
+        z = precondition(now)
+        new = dot(now, z)
+        change = new - dot(before, z)
+        p = plus(z, p, jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0))
+        return x, rest, now, p, new, jnp.where(count == 0, new, first), count + 1
 
-    start = (zero, b, zero, zero, jnp.zeros((), like.dtype), jnp.zeros((), like.dtype), none)
-    x, *_, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
-    return LeastSquares(x, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1)
+    start = (zeros, b, zeros, zeros, zero, zero, none)
+    x, rest, *_, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
+    return LeastSquares(x, rest, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1)
+
+
+def dot(a: PyTree, b: PyTree) -> Array:
+    """Sum the products of all numbers."""
+    return sum((jnp.vdot(v, w) for v, w in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)), start=0.0)
+
+
+def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:
+    """Compute a + factor b."""
+    return jax.tree.map(lambda v, w: v + factor * w, a, b)
 
 
 class _Direction(eqx.Module):
@@ -83,12 +99,12 @@ class PreconditionedDescent(optx.AbstractDescent):
     """The Gauss–Newton direction.
 
     Attributes:
-        precondition: Approximate inverse of JᵀJ.
+        precondition: Makes, from J, an approximate inverse of JᵀJ.
         rtol: Relative tolerance of each linear system.
         most: Most iterations of each.
     """
 
-    precondition: Callable[[Array], Array]
+    precondition: Callable[[Any], Callable[[PyTree], PyTree]]
     rtol: Array
     most: Array
 
@@ -102,12 +118,12 @@ class PreconditionedDescent(optx.AbstractDescent):
         del y
         J = f_info.jac
         residual = f_info.residual
-        solved = least_squares(J.mv, J.T.mv, self.precondition, residual, self.rtol, self.most, _NEGLIGIBLE)
+        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, self.most, _NEGLIGIBLE)
         return _Direction(solved.x, state.iterations + solved.iterations, optx.RESULTS.successful)
 
     def step(self, step_size, state):
         """Go a part of the way."""
-        return -step_size * state.newton, state.result
+        return jax.tree.map(lambda v: -step_size * v, state.newton), state.result
 
 
 class _StepSize(eqx.Module):

@@ -39,6 +39,7 @@ class Observation(eqx.Module):
         certainty: One over the standard deviation of every pixel [1/mm], correlation counted in; 0 where none.
         representation: Pixels minus the surface [mm], 0 where no pixel counts.
         informed: How many spline coefficients the pixels determine [-].
+        model_std: The model's own error that `certainty` allows for [mm].
     """
 
     surface: Nodes
@@ -47,6 +48,7 @@ class Observation(eqx.Module):
     certainty: Map
     representation: Map
     informed: Array
+    model_std: Array
 
     def misfit(self, heights: Nodes) -> Map:
         """Compare heights of the interface [mm] with the measured surface, pixel by pixel, over its noise [-]."""
@@ -68,22 +70,28 @@ class Observation(eqx.Module):
         return jnp.sqrt(jnp.sum(self.representation**2) / jnp.maximum(counted, 1))
 
 
-def observe(mesh: LayerMesh, thickness: ThicknessMap, std: ScalarLike | Map) -> Observation:
+def observe(
+    mesh: LayerMesh, thickness: ThicknessMap, std: ScalarLike | Map, model_std: ScalarLike = 0.0
+) -> Observation:
     """Project a map onto the mesh's splines.
 
     Noise that is correlated over less than about two elements acts like white noise of the same power at long
-    waves; it enters as that, which takes its shorter waves for a little larger than they are.
+    waves; it enters as that, which takes its shorter waves for a little larger than they are. The model's own error,
+    one value per element's area, enters in the same way.
 
     Args:
         mesh: The layer's mesh.
         thickness: The measured map.
         std: Standard deviation of the noise of its pixels [mm], a number or a map.
+        model_std: Standard deviation of the height that the model computes [mm].
     """
     (hx, hy), (my, mx) = mesh.spacing, mesh.thickness.shape
     rows, inside_y = _spline_values(thickness.y / hy, my - 1)
     columns, inside_x = _spline_values(thickness.x / hx, mx - 1)
     counted = inside_y[:, None] & inside_x & ~thickness.mask
-    sigma = jnp.broadcast_to(std, thickness.shape) * jnp.sqrt(_correlated_pixels(thickness))
+    pixels = hx * hy / (thickness.spacing[0] * thickness.spacing[1])  # in an element's area
+    variance = jnp.broadcast_to(std, thickness.shape) ** 2 * _correlated_pixels(thickness) + model_std**2 * pixels
+    sigma = jnp.sqrt(variance)
     certainty = jnp.where(counted, 1.0 / jnp.where(counted, sigma, 1.0), 0.0)
     values = jnp.where(counted, thickness.values, 0.0)
 
@@ -99,7 +107,7 @@ def observe(mesh: LayerMesh, thickness: ThicknessMap, std: ScalarLike | Map) -> 
     surface, _ = jax.scipy.sparse.linalg.cg(normal, right, tol=1e-12, maxiter=40 * max(my, mx))
     representation = jnp.where(counted, values - rows @ surface @ columns.T, 0.0)
     share = (rows**2).T @ weight @ columns**2 / jnp.where(precision > 0, precision, 1.0)
-    return Observation(surface, rows, columns, certainty, representation, jnp.sum(share > 1e-3))
+    return Observation(surface, rows, columns, certainty, representation, jnp.sum(share > 1e-3), jnp.asarray(model_std))
 
 
 def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:

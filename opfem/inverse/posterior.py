@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .gauss_newton import LeastSquares, least_squares
+from .gauss_newton import LeastSquares, least_squares, plus
 
 # Relative gradient of each draw's linear system, and most iterations.
 _RTOL = 1e-2
@@ -20,41 +20,55 @@ class Posterior(eqx.Module):
 
     Attributes:
         white: The optimum.
-        jacobian: Of standardised misfit and prior by white unknowns: operator from unknowns to both.
+        jacobian: Of all standardised residuals, those of the prior included, by white unknowns.
         precondition: Approximate inverse of its normal matrix.
     """
 
-    white: Array
+    white: PyTree
     jacobian: lx.AbstractLinearOperator
-    precondition: Callable[[Array], Array]
+    precondition: Callable[[PyTree], PyTree]
 
-    def solve(self, b) -> LeastSquares:
-        """Find the change of the unknowns that makes residuals change by b, as nearly as possible."""
-        J = self.jacobian
-        return least_squares(J.mv, J.T.mv, self.precondition, b, _RTOL, _STEPS)
+    def solve(self, residual: PyTree, gradient: PyTree | None = None, rtol: float | Array = _RTOL) -> LeastSquares:
+        """Find the change of the unknowns that makes residuals change as asked, as nearly as possible.
 
-    def covariance(self, weights: Array) -> Array:
+        Args:
+            residual: Change asked of each residual.
+            gradient: What to add to the right-hand side of the normal equations; None: nothing.
+            rtol: Relative tolerance of the gradient.
+        """
+        if gradient is None:
+            gradient = jax.tree.map(jnp.zeros_like, self.white)
+        return _solve(self, residual, gradient, jnp.asarray(rtol))
+
+    def residual_structure(self) -> PyTree:
+        """Return shapes and types of the residuals."""
+        return self.jacobian.out_structure()
+
+    def covariance(self, weights: PyTree, rtol: float = _RTOL) -> PyTree:
         """Multiply the posterior covariance of the white unknowns with weights."""
-        misfit, held = jax.eval_shape(self.jacobian.mv, self.white)
-        # The prior's rows are diagonal: they turn a right-hand side into any gradient.
-        rows = self.jacobian.mv(jnp.ones_like(self.white))[1]
-        return self.solve((jnp.zeros(misfit.shape, misfit.dtype), (weights / rows).astype(held.dtype))).x
+        nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), self.residual_structure())
+        return self.solve(nothing, weights, rtol).x
 
-    def draw(self, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+    def draw(self, key: PRNGKeyArray) -> tuple[PyTree, PyTree, Array]:
         """Draw a deviation from the optimum.
 
         Least squares against white noise in every residual has exactly the posterior's covariance.
 
         Returns:
-            The deviation of the white unknowns; how many degrees of freedom it takes from the data, whose
-            mean over draws is their effective number; iterations.
+            The deviation of the white unknowns; of the residuals; iterations. The sum of squares of a part of the
+            residuals, averaged over draws, is the number of degrees of freedom that they determine.
         """
-        structure = jax.eval_shape(self.jacobian.mv, self.white)
-        keys = jax.random.split(key, len(jax.tree.leaves(structure)))
-        leaves, tree = jax.tree.flatten(structure)
+        leaves, tree = jax.tree.flatten(self.residual_structure())
+        keys = jax.random.split(key, len(leaves))
         noise = jax.tree.unflatten(
             tree, [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
         )
         solved = self.solve(noise)
-        misfit, _ = self.jacobian.mv(solved.x)
-        return solved.x, jnp.sum(misfit**2), solved.iterations
+        return solved.x, plus(noise, solved.rest, -1.0), solved.iterations
+
+
+# One compiled program for all that a posterior is asked: products with the Jacobian are large.
+@eqx.filter_jit
+def _solve(posterior: Posterior, residual: PyTree, gradient: PyTree, rtol: Array) -> LeastSquares:
+    J = posterior.jacobian
+    return least_squares(J.mv, J.T.mv, posterior.precondition, residual, rtol, _STEPS, gradient=gradient)

@@ -2,15 +2,20 @@
 
 Indentation grows about with the cube of the local thickness where the layer is thin against the waves of the
 pressure. With that, and with what is masked, the normal matrix is no longer diagonal in cosines, but its products
-cost four transforms: its systems are solved by conjugate gradients of their own.
+cost four transforms: its systems are solved by conjugate gradients of their own. Fitted numbers, coupled to
+everything but few, are added as a coarse space of exact products with the Jacobian.
 """
+
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..model import Palpation
 from .estimates import response
+from .gauss_newton import dot, plus
 from .observation import Nodes, Observation
 from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
 from .transfer import wave_numbers
@@ -19,8 +24,22 @@ _RTOL = 1e-3
 _STEPS = 200
 
 
+class Unknowns(NamedTuple):
+    """White unknowns of a fit: every number standard normal under the prior.
+
+    Attributes:
+        normal: Of the normal traction of every map `(maps, ny+1, nx+1)`.
+        lateral: Of the lateral traction `(maps, 2, ny+1, nx+1)`; None where it follows friction.
+        numbers: Of the experiment's fitted numbers, by name.
+    """
+
+    normal: Float[Array, "maps my mx"]
+    lateral: Float[Array, "maps 2 my mx"] | None
+    numbers: dict[str, Array]
+
+
 class LayerNormal(eqx.Module):
-    """Approximate normal matrix of misfit and prior; calling it multiplies with its inverse.
+    """Approximate normal matrix of misfit and prior for each map; calling that of one multiplies with its inverse.
 
     Attributes:
         prior: The prior.
@@ -32,9 +51,9 @@ class LayerNormal(eqx.Module):
 
     prior: AbstractPrior
     spacing: Spacing
-    gain: Nodes
-    softness: Nodes
-    precision: Nodes
+    gain: Float[Array, "*maps my mx"]
+    softness: Float[Array, "*maps my mx"]
+    precision: Float[Array, "*maps my mx"]
 
     def __call__(self, gradient: Nodes) -> Nodes:
         """Multiply with the inverse, to 1e-3."""
@@ -56,9 +75,78 @@ class LayerNormal(eqx.Module):
         )[0]
 
 
-def layer_normal(palpation: Palpation, observation: Observation, prior: AbstractPrior) -> LayerNormal:
-    """Build the preconditioner of a fit."""
+class FitNormal(eqx.Module):
+    """The preconditioner of a whole fit; calling it with the Jacobian J makes that of JᵀJ.
+
+    Attributes:
+        maps: One `LayerNormal` per map, stacked.
+    """
+
+    maps: LayerNormal
+
+    def __call__(self, J: Any) -> "Preconditioner":
+        """Add fitted numbers, by products with J: two forward and one transposed for each."""
+        whole = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), J.in_structure())
+        names = list(whole.numbers)
+        if not names:
+            return Preconditioner(self.maps, None, None)
+        maps = Preconditioner(self.maps, None, None)
+
+        def direction(one):
+            alone = whole._replace(numbers={name: one[i] for i, name in enumerate(names)})
+
+            # The first pass finds what change of the tractions this number calls for, the second what both do together.
+            def go(carry, _):
+                _, z, _ = carry
+                image = J.mv(z)
+                followed = maps(J.T.mv(image))
+                followed = followed._replace(numbers=jax.tree.map(jnp.zeros_like, followed.numbers))
+                return (z, plus(alone, followed, -1.0), image), None
+
+            nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), J.out_structure())
+            (z, _, image), _ = jax.lax.scan(go, (whole, alone, nothing), length=2)
+            return z, image
+
+        directions, images = jax.lax.map(direction, jnp.eye(len(names)))
+        coarse = jax.vmap(lambda a: jax.vmap(lambda b: dot(a, b))(images))(images)
+        return Preconditioner(self.maps, directions, jnp.linalg.inv(coarse))
+
+
+class Preconditioner(eqx.Module):
+    """Approximate inverse of a normal matrix.
+
+    Attributes:
+        maps: One `LayerNormal` per map, stacked.
+        directions: Of fitted numbers, with what the tractions do about them, stacked; None without.
+        coarse: Inverse of the normal matrix between these.
+    """
+
+    maps: LayerNormal
+    directions: Unknowns | None
+    coarse: Float[Array, "numbers numbers"] | None
+
+    def __call__(self, gradient: Unknowns) -> Unknowns:
+        """Multiply with the inverse."""
+
+        def one(gain, softness, precision, part):
+            return LayerNormal(self.maps.prior, self.maps.spacing, gain, softness, precision)(part)
+
+        maps = self.maps
+        change = gradient._replace(normal=jax.vmap(one)(maps.gain, maps.softness, maps.precision, gradient.normal))
+        if self.directions is None:
+            return change
+        along = self.coarse @ jax.vmap(lambda z: dot(z, gradient))(self.directions)
+        fitted = jax.tree.map(lambda z: jnp.tensordot(along, z, 1), self.directions)
+        return plus(change._replace(numbers=jax.tree.map(jnp.zeros_like, change.numbers)), fitted)
+
+
+def fit_normal(palpation: Palpation, observations: Observation, prior: AbstractPrior) -> FitNormal:
+    """Build the preconditioner of a fit from its stacked observations."""
     mesh = palpation.mesh()
-    pressed = observation.surface / jnp.mean(observation.surface)
-    gain = response(palpation, jnp.mean(observation.surface))
-    return LayerNormal(prior, mesh.spacing, gain, jnp.clip(pressed, 0.1, 10.0) ** 3, observation.precision)
+
+    def one(observation):
+        pressed = observation.surface / jnp.mean(observation.surface)
+        softness = jnp.clip(pressed, 0.1, 10.0) ** 3
+        return response(palpation, jnp.mean(observation.surface)), softness, observation.precision
+
+    return FitNormal(LayerNormal(prior, mesh.spacing, *jax.vmap(one)(observations)))

@@ -4,6 +4,8 @@ A prior turns white noise into tractions, `mean + expand(white)`: what is fitted
 itself costs nothing and its preconditioner is at hand. All of it by cosine transforms, O(n log n).
 """
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.fft
@@ -46,6 +48,11 @@ class AbstractPrior(eqx.Module):
     def penalised(self, shape: tuple[int, int]) -> np.ndarray:
         """Tell how firmly the prior holds white unknowns near zero: 1, or `_HARDLY` where it says nothing."""
         return np.ones(shape)
+
+    def held(self, white: Nodes, spacing: Spacing) -> Array:
+        """Compute what the prior holds near zero, standardised: half its sum of squares is the prior's energy."""
+        del spacing
+        return jnp.asarray(self.penalised(white.shape)) * white
 
     def expand(self, white: Nodes, spacing: Spacing) -> Nodes:
         """Turn white unknowns into deviations from the mean [MPa]."""
@@ -152,6 +159,61 @@ class Tikhonov(AbstractPrior):
         held = np.ones(shape)
         held[0, 0] = _HARDLY
         return held
+
+
+class TotalVariation(AbstractPrior):
+    """A penalty on edges by their height, not their steepness: weight ∫ (√(|∇p|² + slope²) - slope) over the interface.
+
+    Smooth below `slope`, where it is `Tikhonov(1, √(weight/slope))`. It says nothing of the mean pressure. Its
+    posterior is that of the quadratic penalty which touches it at the optimum.
+
+    Args:
+        weight: Factor of the penalty [1/(MPa mm)].
+        slope: Gradient of the pressure above which it counts as an edge [MPa/mm].
+        mean: What differences are taken from, a number or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
+
+    Raises:
+        ValueError: If the weight or the slope is not positive.
+
+    Source:
+        Rudin, Osher & Fatemi, Physica D 60 (1992) 259, smoothed as in Vogel & Oman, SIAM J. Sci. Comput. 17 (1996) 227.
+    """
+
+    weight: Array = eqx.field(converter=as_leaf)
+    slope: Array = eqx.field(converter=as_leaf)
+    mean: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+
+    def __check_init__(self):
+        check_positive("TotalVariation.weight", "1/(MPa mm)", self.weight)
+        check_positive("TotalVariation.slope", "MPa/mm", self.slope)
+
+    @property
+    def _smooth(self) -> Tikhonov:
+        return Tikhonov(1, jnp.sqrt(self.weight / self.slope))
+
+    def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
+        """Compute the standard deviation of every orthonormal cosine mode [MPa] where the pressure is smooth."""
+        return self._smooth.mode_std(k, spacing)
+
+    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Array:
+        """Compute what nodal values are multiplied with: 1."""
+        return jnp.ones(())
+
+    def penalised(self, shape: tuple[int, int]) -> np.ndarray:
+        """Tell how firmly the prior holds white unknowns near zero where the pressure is smooth: all but the mean."""
+        return self._smooth.penalised(shape)
+
+    def held(self, white: Nodes, spacing: Spacing) -> tuple[Array, Array]:
+        """Compute slopes, standardised so that half their sum of squares is the penalty; and what holds the mean."""
+        hx, hy = spacing
+        p = self.expand(white, spacing)
+        along_x, along_y = (p[:, 1:] - p[:, :-1]) / hx, (p[1:] - p[:-1]) / hy
+        # Of each element every corner with its two edges: differences across it would not see a checkerboard.
+        edges = itertools.product((along_x[:-1], along_x[1:]), (along_y[:, :-1], along_y[:, 1:]))
+        slopes = jnp.stack([jnp.stack(pair) for pair in edges])
+        length = jnp.sqrt(jnp.sum(slopes**2, axis=1, keepdims=True) + self.slope**2)
+        factor = jnp.sqrt(0.5 * self.weight * hx * hy / (length + self.slope))
+        return factor * slopes, _HARDLY * white[0, 0]
 
 
 def on_nodes(prior: AbstractPrior, shape: tuple[int, int]) -> Nodes:

@@ -5,13 +5,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..measurement import ThicknessMap
 from ..solvers import Solution
-from .observation import Nodes
+from .misfit import Misfit
 from .posterior import Posterior
+from .preconditioner import Unknowns
 from .prior import AbstractPrior
+
+# A direction counts as not observed when the data leave it this part of its standard deviation before.
+_NOT_OBSERVED = 0.5
+# The lowest cosine modes (rows, columns) that are looked at by name.
+_MODES = {"mean pressure": (0, 0), "pressure rising along x": (0, 1), "pressure rising along y": (1, 0)}
 
 
 class FitStatus(eqx.Enumeration):
@@ -24,57 +31,75 @@ class FitStatus(eqx.Enumeration):
     )
     not_carried = (
         "The layer does not carry the traction that the fit starts from. Give the prior a smaller std or a longer "
-        "length, or smooth the map."
+        "length; where the sample does not touch, mask the map, or keep the layer from being pulled off its window by "
+        "fit_traction(nonnegative=True)."
     )
     nonfinite = "A derivative of the layer's response is not finite: a linear solve did not converge. Smooth the map."
 
 
+class FitError(RuntimeError):
+    """A fit ended without an optimum."""
+
+
 class TractionFit(eqx.Module):
-    """The traction fitted to a measured map.
+    """The traction fitted to a measured map, or to several: arrays then have a leading axis, one entry per map.
 
     Attributes:
         solution: The layer under the fitted traction, solved to the solver's own tolerance.
         pressure_std: Posterior standard deviation of `pressure`, on the current area [MPa].
         normal_std: The same of the normal traction, per reference area [MPa].
-        chi2: Sum of squared misfits between interface and measured surface over their noise [-].
-        effective_dof: How many degrees of freedom the data determine [-].
-        observed: How many the map could have determined [-]: its independent numbers on the mesh's splines.
+        chi2: Sum of squared misfits between interface and measured surface over their noise, of all maps [-].
+        effective_dof: How many degrees of freedom the maps determine [-].
+        observed: How many they could have determined [-]: their independent numbers on the mesh's splines.
         residual: Interface minus measured surface at the mesh's own grid in space [mm].
-        stats: `gauss_newton_steps`, `forward_solves`, `inner_iterations` (each one product with the Jacobian and one
+        resolution_points: Where the resolution was looked at, (x, y) of nodes [mm].
+        resolution_width: Width of the posterior's resolution kernel there [mm]: what a point of truth is smeared over.
+            That of the Gaussian of the same peak and sum of squares, full width at half maximum: 1.3 elements where
+            the mesh itself is the limit.
+        deviations: Draws of the normal traction minus the optimum, which standard deviations come from [MPa].
+        number_deviations: The same of fitted numbers, of their white unknowns [-], by name.
+        misfit: What was minimised, with the prior as chosen.
+        posterior: The posterior of the white unknowns.
+        stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (each one product with the Jacobian and one
             with its transpose), `posterior_iterations`, `draws`, `std_error` (relative standard error of the standard
             deviations [-]), `representation_rms` [mm] (what the map has beyond mesh-spaced splines),
             `misfit_rms` [mm].
         result: How the fit ended.
-        posterior: The posterior of the white unknowns.
-        prior: The prior.
-        deviations: Draws of the normal traction minus the optimum, which standard deviations come from [MPa].
     """
 
     solution: Solution
-    pressure_std: Nodes
-    normal_std: Nodes
+    pressure_std: Array
+    normal_std: Array
     chi2: Array
     effective_dof: Array
     observed: Array
-    residual: Nodes
+    residual: Array
+    resolution_points: Float[np.ndarray, "points 2"]
+    resolution_width: Float[np.ndarray, "*maps points"]
+    deviations: Array
+    number_deviations: dict[str, Float[Array, " draws"]]
+    misfit: Misfit
+    posterior: Posterior
     stats: dict[str, Any]
     result: FitStatus
-    posterior: Posterior
-    prior: AbstractPrior
-    deviations: Float[Array, "draws my mx"]
 
     @property
-    def traction(self) -> Float[Array, "3 my mx"]:
+    def prior(self) -> AbstractPrior:
+        """The prior of the normal traction, its hyper-parameters as chosen."""
+        return self.misfit.prior
+
+    @property
+    def traction(self) -> Float[Array, "*maps 3 my mx"]:
         """Force on the layer at the interface per reference area [MPa]."""
         return self.solution.traction
 
     @property
-    def normal(self) -> Nodes:
+    def normal(self) -> Float[Array, "*maps my mx"]:
         """Normal traction per reference area, positive in compression [MPa]: what was fitted."""
-        return -self.solution.traction[2]
+        return -self.solution.traction[..., 2, :, :]
 
     @property
-    def pressure(self) -> Nodes:
+    def pressure(self) -> Float[Array, "*maps my mx"]:
         """Pressure on the sample, on the current area [MPa]."""
         return self.solution.pressure
 
@@ -88,21 +113,45 @@ class TractionFit(eqx.Module):
         """χ² over the degrees of freedom that are left to judge it by: near 1 where model and noise are right."""
         return self.chi2 / (self.observed - self.effective_dof)
 
-    def draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n my mx"]:
+    @property
+    def numbers(self) -> dict[str, Array]:
+        """Fitted numbers of the experiment, by name."""
+        return self.misfit.numbers(self.posterior.white)
+
+    def number_intervals(self, coverage: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Compute intervals that hold fitted numbers with the probability asked for, by name."""
+        half = float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * coverage))
+        spread = dict(zip(self.misfit.parameters, jnp.sqrt(jnp.diag(self.number_covariance())), strict=True))
+        white = self.posterior.white.numbers
+        return {
+            name: tuple(float(prior.number(white[name] + sign * half * spread[name])) for sign in (-1.0, 1.0))
+            for name, prior in self.misfit.parameters.items()
+        }
+
+    def number_covariance(self) -> Float[Array, "numbers numbers"]:
+        """Compute the posterior covariance of the fitted numbers' white unknowns, each of variance 1 before the fit."""
+        names = list(self.misfit.parameters)
+        nothing = jax.tree.map(jnp.zeros_like, self.posterior.white)
+
+        def column(one):
+            weights = nothing._replace(numbers={name: one[i] for i, name in enumerate(names)})
+            pulled = self.posterior.covariance(weights).numbers
+            return jnp.stack([pulled[name] for name in names])
+
+        columns = jnp.stack([column(one) for one in jnp.eye(len(names))])
+        return 0.5 * (columns + columns.T)
+
+    def draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n *maps my mx"]:
         """Draw normal tractions from the posterior [MPa].
 
         Args:
             key: Random key.
             n: How many.
         """
-        spacing = self.solution.palpation.mesh().spacing
+        drawn = jnp.stack([_draw(self.posterior, self.misfit, one) for one in jax.random.split(key, n)])
+        return self._like_normal(drawn)
 
-        def one(key):
-            return self.prior.expand(self.posterior.draw(key)[0], spacing)
-
-        return self.normal + jax.lax.map(one, jax.random.split(key, n))
-
-    def covariance(self, weights: Nodes) -> Nodes:
+    def covariance(self, weights: Float[Array, "*maps my mx"]) -> Float[Array, "*maps my mx"]:
         """Multiply the posterior covariance of the normal traction with weights: Cov(p, Σ weights p).
 
         The variance of the weighted sum Σ weights p is the sum of weights times the answer.
@@ -110,6 +159,60 @@ class TractionFit(eqx.Module):
         Args:
             weights: Of every node `(ny+1, nx+1)` [-].
         """
-        spacing = self.solution.palpation.mesh().spacing
-        _, pull = jax.vjp(lambda white: self.prior.expand(white, spacing), jnp.zeros_like(weights))
-        return self.prior.expand(self.posterior.covariance(pull(weights)[0]), spacing)
+        stacked = weights.reshape(self.posterior.white.normal.shape)
+        return self._like_normal(_normal_covariance(self.posterior, self.misfit, stacked)[None])[0]
+
+    def unobserved(self) -> dict[str, tuple[float, float]]:
+        """Name what the maps do not tell: directions that keep over half of their standard deviation before the fit.
+
+        Looked at are mean and tilt of the pressure of each map, and fitted numbers. Under a bonded, nearly
+        incompressible layer a uniform pressure hardly moves the interface: its mean then rests on the prior.
+
+        Returns:
+            By name: standard deviation after and before the fit [MPa for pressures, - for numbers' white unknowns].
+        """
+        found: dict[str, tuple[float, float]] = {}
+        shape = self.posterior.white.normal.shape
+        for i in range(shape[0]):
+            for name, mode in _MODES.items():
+                weights = jnp.zeros(shape).at[i].set(_cosine(shape[1:], mode))
+                after = jnp.sqrt(jnp.sum(weights * _normal_covariance(self.posterior, self.misfit, weights)))
+                before = jnp.sqrt(jnp.sum(_prior_pull(self.posterior, self.misfit, weights).normal ** 2))
+                label = name if shape[0] == 1 else f"{name} of map {i}"
+                # What the prior does not hold has no standard deviation before the fit.
+                penalised = self.prior.penalised(shape[1:])[mode] == 1.0
+                if penalised and after > _NOT_OBSERVED * before:
+                    found[label] = (float(after), float(before))
+        if self.misfit.parameters:
+            spread = np.sqrt(np.diag(np.asarray(self.number_covariance())))
+            for name, after in zip(self.misfit.parameters, spread, strict=True):
+                if after > _NOT_OBSERVED:
+                    found[name] = (float(after), 1.0)
+        return found
+
+    def _like_normal(self, stacked: Float[Array, "n maps my mx"]) -> Array:
+        """Add nothing to draws of several maps; of a single one take the axis of maps away."""
+        normal = self.misfit.normal(self.posterior.white)
+        return stacked if self.residual.ndim == 3 else stacked.reshape(stacked.shape[0], *normal.shape[1:])
+
+
+def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):
+    normal, change = jax.jvp(misfit.normal, (posterior.white,), (posterior.draw(key)[0],))
+    return normal + change
+
+
+def _normal_covariance(posterior: Posterior, misfit: Misfit, weights: Array) -> Array:
+    pulled = _prior_pull(posterior, misfit, weights)
+    return jax.jvp(misfit.normal, (posterior.white,), (posterior.covariance(pulled),))[1]
+
+
+def _prior_pull(posterior: Posterior, misfit: Misfit, weights: Array) -> Unknowns:
+    return jax.vjp(misfit.normal, posterior.white)[1](weights)[0]
+
+
+def _cosine(shape: tuple[int, ...], mode: tuple[int, int]) -> Array:
+    """Make weights of mean one-node size: an average for mode (0, 0), else a difference between the sides."""
+    my, mx = shape
+    y = jnp.cos(jnp.pi * mode[0] * (jnp.arange(my) + 0.5) / my)
+    x = jnp.cos(jnp.pi * mode[1] * (jnp.arange(mx) + 0.5) / mx)
+    return y[:, None] * x / (my * mx)

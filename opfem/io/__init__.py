@@ -2,6 +2,7 @@
 
 from ..measurement import MeasurementError
 from .atomic import whole_file
+from .checkpoint import Checkpoint as Checkpoint
 from .netcdf import read_netcdf, write_netcdf
 from .thickness import read_thickness, write_thickness
 from .vtk import layer_grid, write_pvd, write_vtu

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..model import Contact, HeightField
+from ..model.surface import Patches
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
 from .staging import apart
@@ -120,6 +121,25 @@ class RigidSurface(eqx.Module):
             return zero, zero, zero
         low, high = self.start.coefficients, self.end.coefficients
         return eqx.tree_at(lambda f: f.coefficients, self.end, (1.0 - fraction) * low + fraction * high)(x, y)
+
+    def around(self, x: Array, y: Array) -> "RigidPatches | None":
+        """Collect what the surface is made of around points [mm]; None for the plane z = 0."""
+        if self.start is None or self.end is None:
+            return None
+        return RigidPatches(self.start.around(x, y), self.end.around(x, y))
+
+
+class RigidPatches(eqx.Module):
+    """A rigid surface around points, at the start and at the end of its motion."""
+
+    start: Patches
+    end: Patches
+
+    def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        """Evaluate height [mm], slopes [-] and rise per load fraction [mm]."""
+        low, high = self.start.powers, self.end.powers
+        height, slope_x, slope_y = eqx.tree_at(lambda p: p.powers, self.end, low + fraction * (high - low))(x, y)
+        return height, slope_x, slope_y, eqx.tree_at(lambda p: p.powers, self.end, high - low).height(x, y)
 
 
 class ImposedPressure(eqx.Module):

@@ -11,6 +11,7 @@ The forms differ in what of the deformation their cells measure:
 """
 
 import itertools
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -63,6 +64,16 @@ class SolidBody(eqx.Module):
             P = P + self._hourglass_stiffness * (H - self.cells.mean(H, 2))
         return self.cells.assemble(self.cells.nodal_vectors(P * self.cells.weight)), jnp.min(k.J)
 
+    def internal_force_with(self, u: Array, extra_stress: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Compute the force [N] with a mean stress [MPa] added by each cell's mean J - 1, and that mean."""
+        H = self.cells.displacement_gradient(u)
+        k, weight = self._measured(self.cells, H)
+        change = jnp.sum(k.volume_change * weight, axis=0, keepdims=True) / self.cells.volume
+        P = self.material.first_piola(k, self._mean_stress(self.cells, k, None) + extra_stress(change[0]))
+        if self.form == "reduced":
+            P = P + self._hourglass_stiffness * (H - self.cells.mean(H, 2))
+        return self.cells.assemble(self.cells.nodal_vectors(P * self.cells.weight)), change[0]
+
     def cell_stiffness(
         self, u: Array, mean_stress: Array | None = None, bulk: Array | None = None, more: Array | None = None
     ) -> Array:
@@ -85,7 +96,7 @@ class SolidBody(eqx.Module):
         """Compute dP/dF times the points' volumes [N mm], of a form that measures at each point."""
         assert self.form == "full"
         k, weight = self._measured(self.cells, self.cells.displacement_gradient(u))
-        return self._full_tangent(k).entries() * weight
+        return self.full_tangent(k).entries() * weight
 
     def volume_residual(self, u: Array, mean_stress: Array) -> Array:
         """Compute V (mean J - 1 - mean stress/bulk) of each cell [mm³], zero in a `hybrid` equilibrium."""
@@ -136,7 +147,8 @@ class SolidBody(eqx.Module):
         volumetric = self.material.volumetric_energy(change) if mean_stress is None else 0.5 * mean_stress * change
         return self.material.isochoric_energy(k) + volumetric
 
-    def _full_tangent(self, k: Kinematics) -> ProductSum:
+    def full_tangent(self, k: Kinematics) -> ProductSum:
+        """Compute dP/dF [MPa] where all of the deformation is measured at each point."""
         A = self.material.tangent(k, self.material.volumetric_stress(k.volume_change))
         return A + ProductSum(direct=((self.material.bulk * k.J**2, k.G, k.G),))
 
@@ -151,7 +163,7 @@ class SolidBody(eqx.Module):
         if self._of_mean_volume:
             A = self.material.tangent(k, self._mean_stress(cells, k, mean_stress))
             return cells.referred(A.scaled(weight)), cells.nodal_vectors(k.J * k.G * weight)
-        A = self._full_tangent(k)
+        A = self.full_tangent(k)
         if self.form == "reduced":  # what holds the hourglass modes does not hold the mean strain
             A = A + self._held(-self._hourglass_stiffness, k.F)
             return A.scaled(weight), None

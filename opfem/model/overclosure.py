@@ -4,6 +4,7 @@ Clearance g > 0 is open; pressure is positive in compression and acts on the cur
 Every law is finite, with a finite slope, for any clearance.
 """
 
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -153,14 +154,14 @@ class ExponentialOverclosure(AbstractOverclosure):
         top = 1.0 + _LINEAR_BEYOND
         inside = jnp.clip(s, 0.0, top)
         exponential = jnp.exp(inside)
-        slope = (1.0 + top) * np.exp(top) - 1.0
+        slope = (1.0 + top) * math.exp(top) - 1.0
         return self.p0 / (np.e - 1.0) * (inside * (exponential - 1.0) + slope * jnp.maximum(s - top, 0.0))
 
     def clearance(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure, by Newton's method on s (eˢ - 1)."""
         ratio = pressure * (np.e - 1.0) / self.p0
         top = 1.0 + _LINEAR_BEYOND
-        at_top, slope = top * (np.exp(top) - 1.0), (1.0 + top) * np.exp(top) - 1.0
+        at_top, slope = top * (math.exp(top) - 1.0), (1.0 + top) * math.exp(top) - 1.0
         inside = jnp.minimum(ratio, at_top)
         s = jnp.where(inside < 1.0, jnp.sqrt(inside), jnp.maximum(jnp.log1p(inside), 0.5))
         for _ in range(_INVERSE_STEPS):

@@ -32,17 +32,59 @@ class HeightField(eqx.Module):
 
     def __call__(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Evaluate height [mm] and slopes ds/dx, ds/dy [-] at spatial points [mm]."""
+        return self.around(x, y)(x, y)
+
+    def around(self, x: Array, y: Array) -> "Patches":
+        """Collect what the surface is made of around points [mm], to evaluate it there again and again."""
         my, mx = self.coefficients.shape
-        i, tx, inside_x = _locate((x - self.origin[0]) / self.spacing[0], mx)
-        j, ty, inside_y = _locate((y - self.origin[1]) / self.spacing[1], my)
-        around = np.arange(-1, 3).reshape(4, *[1] * tx.ndim)
+        i, j = _cell(self._in_cells(x, 0), mx), _cell(self._in_cells(y, 1), my)
+        around = np.arange(-1, 3).reshape(4, *[1] * i.ndim)
         rows, columns = jnp.clip(j + around, 0, my - 1), jnp.clip(i + around, 0, mx - 1)
         values = self.coefficients[rows[:, None], columns]
-        (wx, dx), (wy, dy) = (_weights(self.interpolation, t) for t in (tx, ty))
-        along = jnp.sum(wx * values, axis=1)
-        slope_x = jnp.sum(wy * jnp.sum(dx * values, axis=1), axis=0) / self.spacing[0]
-        slope_y = jnp.sum(dy * along, axis=0) / self.spacing[1]
-        return jnp.sum(wy * along, axis=0), jnp.where(inside_x, slope_x, 0.0), jnp.where(inside_y, slope_y, 0.0)
+        basis = jnp.asarray(_CUBICS[self.interpolation], values.dtype)
+        powers = jnp.einsum("ma,nb,mn...->ab...", basis, basis, values)
+        return Patches(self, powers, i, j)
+
+    def _in_cells(self, position: Array, axis: int) -> Array:
+        return (position - self.origin[axis]) / self.spacing[axis]
+
+
+class Patches(eqx.Module):
+    """The surface around points, each with the polynomial of its grid cell.
+
+    A point that has left its cell is evaluated on the continued polynomial: right to the third order of the way (the
+    second, "catmull-rom"; the first, "bilinear"), so patches serve while points move by a small part of a cell.
+
+    Attributes:
+        field: The surface.
+        powers: Coefficients [mm] of tyᵃ txᵇ, tx and ty from 0 to 1 across the cell, `(4 a, 4 b, *points)`.
+        i: Columns of the cells.
+        j: Rows of the cells.
+    """
+
+    field: HeightField
+    powers: Float[Array, "4 4 *points"]
+    i: Array
+    j: Array
+
+    def __call__(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Evaluate height [mm] and slopes ds/dx, ds/dy [-] at points [mm]."""
+        tx, ty, inside_x, inside_y = self._local(x, y)
+        rows = [_horner(self.powers[a], tx) for a in range(4)]
+        along_x = _horner([_horner_slope(self.powers[a], tx) for a in range(4)], ty) / self.field.spacing[0]
+        along_y = _horner_slope(rows, ty) / self.field.spacing[1]
+        return _horner(rows, ty), jnp.where(inside_x, along_x, 0.0), jnp.where(inside_y, along_y, 0.0)
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Evaluate the height alone [mm]."""
+        tx, ty, _, _ = self._local(x, y)
+        return _horner([_horner(self.powers[a], tx) for a in range(4)], ty)
+
+    def _local(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        my, mx = self.field.coefficients.shape
+        tx, inside_x = _local(self.field._in_cells(x, 0), self.i, mx)
+        ty, inside_y = _local(self.field._in_cells(y, 1), self.j, my)
+        return tx, ty, inside_x, inside_y
 
 
 def height_field(values: Float[Array, "my mx"], origin, spacing, interpolation: Interpolation) -> HeightField:
@@ -60,11 +102,13 @@ def height_field(values: Float[Array, "my mx"], origin, spacing, interpolation: 
     return HeightField(values, jnp.asarray(origin), jnp.asarray(spacing), interpolation)
 
 
-def _locate(t: Array, n: int) -> tuple[Array, Array, Array]:
+def _cell(t: Array, n: int) -> Array:
+    return jnp.clip(jnp.floor(t), 0, n - 2).astype(int)
+
+
+def _local(t: Array, cell: Array, n: int) -> tuple[Array, Array]:
     inside = (t >= 0.0) & (t <= n - 1.0)
-    t = jnp.clip(t, 0.0, n - 1.0)
-    cell = jnp.clip(jnp.floor(t), 0, n - 2)
-    return cell.astype(int), t - cell, inside
+    return jnp.clip(t, 0.0, n - 1.0) - cell.astype(t.dtype), inside
 
 
 def _spline_prefilter(n: int) -> np.ndarray:
@@ -75,12 +119,13 @@ def _spline_prefilter(n: int) -> np.ndarray:
     return np.linalg.inv(rows / 6)
 
 
-def _weights(interpolation: str, t: Array) -> tuple[Array, Array]:
-    """Weights of the four nodes around a point and their slopes `(4, …)`, at t in the cell [0, 1]."""
-    cubics = jnp.asarray(_CUBICS[interpolation], t.dtype)
-    powers = jnp.stack([jnp.ones_like(t), t, t**2, t**3])
-    slopes = jnp.stack([jnp.ones_like(t), 2 * t, 3 * t**2])
-    return jnp.tensordot(cubics, powers, 1), jnp.tensordot(cubics[:, 1:], slopes, 1)
+def _horner(c, t: Array) -> Array:
+    """Evaluate c0 + c1 t + c2 t² + c3 t³."""
+    return c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+
+
+def _horner_slope(c, t: Array) -> Array:
+    return c[1] + t * (2.0 * c[2] + t * (3.0 * c[3]))
 
 
 # Coefficients of 1, t, t², t³ in the weight of each of the four nodes.

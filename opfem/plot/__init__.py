@@ -1,14 +1,27 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
-from .maps import draw_pictures, plot_pressure, plot_report, plot_residual, plot_status, plot_thickness
+from .maps import (
+    draw_fit,
+    draw_pictures,
+    plot_fit,
+    plot_pressure,
+    plot_report,
+    plot_residual,
+    plot_status,
+    plot_thickness,
+    plot_uncertainty,
+)
 from .scene import plot_layer
 
 __all__ = [
+    "draw_fit",
     "draw_pictures",
+    "plot_fit",
     "plot_layer",
     "plot_pressure",
     "plot_report",
     "plot_residual",
     "plot_status",
     "plot_thickness",
+    "plot_uncertainty",
 ]

@@ -15,10 +15,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch
 
 from ..measurement import ThicknessMap
-from ..results import Solution, to_xarray
+from ..results import Solution, TractionFit, to_xarray
 
 _KPA = 1e3
 _UM = 1e3
@@ -168,6 +168,71 @@ def plot_report(
     return axes
 
 
+def plot_uncertainty(
+    data: TractionFit | xr.Dataset, ax: Axes | None = None, *, vmax: float | None = None, cmap: str = "cividis"
+) -> Axes:
+    """Draw the posterior standard deviation of the pressure [kPa] where it acts.
+
+    Oriented as MATLAB's imagesc: row 0 at the top. Circles are as wide as the fit resolves there.
+
+    Args:
+        data: A traction fit, or its dataset.
+        ax: Axes to draw on; None makes a figure.
+        vmax: Standard deviation at the upper end of the colours [kPa]; None takes the largest.
+        cmap: Name of the colour map.
+
+    Raises:
+        ValueError: For a failed fit.
+    """
+    dataset = _converged(data)
+    ax = _axes(ax)
+    x, y, std = (dataset[name].values for name in ("x_current", "y_current", "pressure_std"))
+    colours = ax.pcolormesh(x, y, _KPA * std, shading="gouraud", cmap=cmap, vmin=0.0, vmax=vmax)
+    extend = "max" if vmax is not None and _KPA * std.max() > vmax else "neither"
+    _colour_bar(ax, colours, "Standard deviation of pressure [kPa]", extend)
+    for centre, width in zip(dataset["resolution_points"].values, dataset["resolution_width"].values, strict=True):
+        ax.add_patch(Circle(tuple(centre), 0.5 * width, fill=False, edgecolor="white", linewidth=0.8))
+    _orient(ax, x, y)
+    return ax
+
+
+def plot_fit(
+    data: TractionFit | xr.Dataset, measured: ThicknessMap | None = None, figure: Figure | None = None
+) -> np.ndarray:
+    """Draw what a traction fit found: pressure, its uncertainty and resolution, what it misses, what was measured.
+
+    Args:
+        data: A traction fit of one map, or its dataset.
+        measured: The measured map; None: the computed thickness is drawn in its place.
+        figure: Empty figure to draw on; None makes one.
+
+    Returns:
+        The four axes, 2 × 2.
+
+    Raises:
+        ValueError: For a failed fit.
+    """
+    dataset = _converged(data)
+    axes = (_shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
+    plot_pressure(dataset, axes[0, 0])
+    plot_uncertainty(dataset, axes[0, 1])
+    x, y, residual = dataset["x"].values, dataset["y"].values, _UM * dataset["residual"].values
+    limit = max(float(np.percentile(np.abs(residual), 99.5)), 1e-3)
+    _image(residual, x, y, axes[1, 0], "Interface − measured surface [µm]", "cividis", (-limit, limit))
+    if measured is None:
+        computed = _UM * dataset["thickness"].values
+        x, y = dataset["x_image"].values, dataset["y_image"].values
+        _image(computed, x, y, axes[1, 1], "Thickness [µm]", "viridis", None)
+    else:
+        plot_thickness(measured, axes[1, 1])
+    width = _UM * np.median(dataset["resolution_width"].values)
+    axes[0, 0].set_title(f"Fitted pressure, {-dataset['force_sample'].values[2]:.3g} N")
+    axes[0, 1].set_title(f"Uncertainty; resolution {width:.0f} µm (circles)")
+    axes[1, 0].set_title(f"Residual, χ² per degree of freedom {float(dataset['reduced_chi2']):.2f}")
+    axes[1, 1].set_title("Computed thickness" if measured is None else "Measured thickness")
+    return axes
+
+
 def draw_pictures(data: xr.Dataset, measured: ThicknessMap) -> dict[str, Figure]:
     """Draw the pictures that go with a palpation's files, by file name, without any display.
 
@@ -181,7 +246,20 @@ def draw_pictures(data: xr.Dataset, measured: ThicknessMap) -> dict[str, Figure]
     return {"pressure.png": pressure, "report.png": report}
 
 
-def _converged(data: Solution | xr.Dataset) -> xr.Dataset:
+def draw_fit(data: xr.Dataset, measured: ThicknessMap) -> dict[str, Figure]:
+    """Draw the pictures that go with a fit's files, by file name, without any display.
+
+    Args:
+        data: Dataset of a fit.
+        measured: The measured map.
+    """
+    pressure, report = (Figure(figsize=size, layout="compressed") for size in (_MAP_SIZE, _REPORT_SIZE))
+    plot_pressure(data, pressure.subplots())
+    plot_fit(data, measured, report)
+    return {"pressure.png": pressure, "fit.png": report}
+
+
+def _converged(data: Solution | TractionFit | xr.Dataset) -> xr.Dataset:
     dataset = data if isinstance(data, xr.Dataset) else to_xarray(data)
     if not np.isfinite(dataset["pressure"].values).all():
         status = dataset.attrs.get("status")

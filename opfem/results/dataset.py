@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .._checks import concrete
 from ..inverse import FitStatus, TractionFit
 from ..model import Imprint
-from ..solvers import RESULTS, FaceResult, Solution
+from ..solvers import CONVERGED, RESULTS, FaceResult, Solution
 from .fields import under_pixels
 from .interior import layer_fields
 from .provenance import describe, inputs_hash, steps_as_json, versions
@@ -24,7 +24,7 @@ IMAGE = ("y_image", "x_image")
 NOT_CONVERGED = -1
 """Contact status where the solve failed."""
 
-_STATS = {
+STATS = {
     "newton_steps": ("1", "Newton steps of all load increments"),
     "krylov_steps": ("1", "preconditioner applications of all linear solves"),
     "increments": ("1", "load increments accepted"),
@@ -44,9 +44,23 @@ _STATS = {
     "approach": ("mm", "approach of sample and layer that the contact law itself causes"),
     "max_penetration": ("mm", "largest penetration"),
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
+    "increment": ("s", "shortest time increment"),
+    "kinetic_ratio": ("1", "largest kinetic over all energy after the first tenth of the load"),
+    "energy_drift": ("1", "largest energy missing from the balance over all energy"),
+    "output_time": ("s", "time of the outputs"),
+    "output_increment": ("s", "time increment before each output"),
+    "energy_strain": ("N mm", "strain energy at every output"),
+    "energy_kinetic": ("N mm", "kinetic energy at every output"),
+    "energy_contact": ("N mm", "energy stored and lost in contact until every output"),
+    "energy_friction": ("N mm", "energy dissipated by friction until every output"),
+    "energy_viscous": ("N mm", "energy dissipated by bulk viscosity until every output"),
+    "energy_damping": ("N mm", "energy dissipated by damping until every output"),
+    "energy_external": ("N mm", "work done by the load until every output"),
+    "energy_total": ("N mm", "all energies less the work done, at every output"),
 }
-_FIT_STATS = {
+FIT_STATS = {
     "forward_solves": ("1", "solves under a trial traction"),
+    "gauss_newton_steps": ("1", "Gauss–Newton steps accepted"),
     "inner_iterations": ("1", "products with the Jacobian and with its transpose, of all Gauss–Newton steps"),
     "posterior_iterations": ("1", "the same of all draws of the posterior"),
     "draws": ("1", "draws of the posterior that standard deviations come from"),
@@ -85,13 +99,13 @@ def to_xarray(solution: Solution | TractionFit, *, interior: bool = False) -> xr
             to_xarray(solution.solution, interior=interior).assign(_fit(solution)).assign_attrs(_fit_record(solution))
         )
     _require_one(solution)
-    failed = status_name(solution) not in ("successful", "slides_off")
+    failed = status_name(solution) not in CONVERGED
     variables = {
         **_volume(solution),
         **_face("", "at the sample", solution.sample, failed),
         **_face("window_", "at the window", solution.window, failed),
         **_image(solution),
-        **_stats(solution.stats, _STATS),
+        **_stats(solution.stats, STATS),
         **(_interior(solution) if interior else {}),
     }
     coordinates = _coordinates(solution)
@@ -234,7 +248,31 @@ def _fit(fit: TractionFit) -> dict[str, Variable]:
         "chi2": _variable((), fit.chi2, "1", "sum of squared misfits over their noise"),
         "effective_dof": _variable((), fit.effective_dof, "1", "degrees of freedom that the map determines"),
         "observed": _variable((), fit.observed, "1", "independent numbers of the map on the mesh's splines"),
-        **_stats(fit.stats, _FIT_STATS),
+        "reduced_chi2": _variable((), fit.reduced_chi2, "1", "chi2 over the degrees of freedom left"),
+        "resolution_points": _variable(
+            ("resolution_point", "lateral"), fit.resolution_points, "mm", "where the resolution was looked at"
+        ),
+        "resolution_width": _variable(
+            ("resolution_point",), fit.resolution_width, "mm", "full width at half maximum of the resolution kernel"
+        ),
+        **_numbers(fit),
+        **_stats(fit.stats, FIT_STATS),
+    }
+
+
+def _numbers(fit: TractionFit) -> dict[str, Variable]:
+    """Fitted numbers of the experiment, in their own units."""
+    if not fit.misfit.parameters:
+        return {}
+    values, intervals = fit.numbers, fit.number_intervals()
+    return {
+        "fitted_number": (("number",), np.array(list(values)), {"long_name": "name of a fitted number"}),
+        "fitted_value": (("number",), np.array([float(v) for v in values.values()]), {"long_name": "fitted value"}),
+        "fitted_interval": (
+            ("number", "bound"),
+            np.array([intervals[name] for name in values]),
+            {"long_name": "bounds of the 95 % interval of a fitted number"},
+        ),
     }
 
 
@@ -252,6 +290,8 @@ def _stats(stats: dict[str, Any], labels: dict[str, tuple[str, str]]) -> dict[st
     for name, value in stats.items():
         values = np.asarray(value)
         dims = ("component",) if values.shape == (3,) else tuple(f"{name}_{axis}" for axis in range(values.ndim))
+        if name.startswith(("energy_", "output_")) and values.ndim == 1:
+            dims = ("output",)
         unit, long_name = labels.get(name, (None, name.replace("_", " ")))
         labelled[name] = (dims, values, {"long_name": long_name} | ({} if unit is None else {"units": unit}))
     return labelled

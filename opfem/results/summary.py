@@ -44,6 +44,9 @@ def summary(solution: Solution) -> dict[str, Any]:
         "residual_relative": float(stats["residual"]),
         **{f"{name}_count": int(stats[name]) for name in ("increments", "attempts", "newton_steps", "krylov_steps")},
     }
+    if "kinetic_ratio" in stats:
+        numbers["kinetic_energy_percent"] = 100.0 * float(stats["kinetic_ratio"])
+        numbers["energy_drift_percent"] = 100.0 * float(stats["energy_drift"])
     return {key: _known(value) for key, value in numbers.items()}
 
 
@@ -66,8 +69,16 @@ def summary_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("approach left by the contact law", f"{numbers['approach_um']:.2g}", "µm"),
         ("largest penetration", f"{numbers['max_penetration_um']:.2g}", "µm"),
         ("smallest volume ratio", f"{numbers['min_volume_ratio']:.3f}", ""),
-        ("load increments, Newton steps", f"{numbers['increments_count']}, {numbers['newton_steps_count']}", ""),
+        *_effort(numbers),
     ]
+
+
+def _effort(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
+    increments = f"{numbers['increments_count']}"
+    if "kinetic_energy_percent" not in numbers:
+        return [("load increments, Newton steps", f"{increments}, {numbers['newton_steps_count']}", "")]
+    shares = f"{numbers['kinetic_energy_percent']:.2g}, {numbers['energy_drift_percent']:.2g}"
+    return [("time increments", increments, ""), ("kinetic energy, energy missing", shares, "%")]
 
 
 def _pressures(solution: Solution) -> dict[str, float]:

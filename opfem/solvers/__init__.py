@@ -1,7 +1,9 @@
-"""Solvers: implicit statics by Newton, multigrid and Krylov iterations."""
+"""Solvers: implicit statics by Newton, multigrid and Krylov iterations; explicit dynamics."""
 
+from .explicit import Explicit as Explicit
 from .newton import Newton as Newton
 from .solution import (
+    CONVERGED as CONVERGED,
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,
     FaceResult as FaceResult,

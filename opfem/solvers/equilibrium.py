@@ -178,7 +178,7 @@ class Problem(eqx.Module):
 
     def reactions(self, forces: Forces) -> Forces:
         """Add the reactions of prescribed displacements to the forces of window and sample."""
-        unbalanced = self._unbalanced(forces)
+        unbalanced = self.unbalanced(forces)
         prescribed = {
             "contact": (0, 0, 0),
             "traction": (0, 0, 0),
@@ -194,7 +194,8 @@ class Problem(eqx.Module):
         sample = sample._replace(face=sample.face + top * unbalanced[:, -1])
         return forces._replace(applied=Bodies(window, sample))
 
-    def _unbalanced(self, forces: Forces) -> Nodal:
+    def unbalanced(self, forces: Forces) -> Nodal:
+        """Compute internal minus applied forces [N], supports left out."""
         unbalanced = forces.internal
         for body, touching in zip(Bodies._fields, forces.applied, strict=True):
             unbalanced = unbalanced - put(touching, body, unbalanced.shape)
@@ -205,7 +206,7 @@ class Problem(eqx.Module):
 
     def residual(self, forces: Forces, held: Array) -> Unknowns:
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
-        return Unknowns(self.project(jnp.asarray(self.free) * self._unbalanced(forces), held), forces.volume)
+        return Unknowns(self.project(jnp.asarray(self.free) * self.unbalanced(forces), held), forces.volume)
 
     def balance(self, x: Unknowns, fraction: Array, state: State, held: Array) -> Unknowns:
         """Compute the equations that a converged displacement fulfils, as many as unknowns [N].
@@ -282,7 +283,7 @@ class Problem(eqx.Module):
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
         if forces.spring is not None:
             return forces.spring
-        return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self._unbalanced(forces))[:2, 0]), 0.0)
+        return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]), 0.0)
 
     def tangent(self, x: Unknowns, fraction: Array, state: State, laws: Bodies, transposed: bool = False) -> Tangent:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.

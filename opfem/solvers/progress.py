@@ -40,6 +40,10 @@ class LoadProgress:
         text = f"solve {attempts}, {newton} Newton steps" + (", snapping" if snaps else "")
         self._bar.update(self._task, completed=fraction, description=text)
 
+    def show_steps(self, fraction: float, steps: int, increment: float) -> None:
+        """Update the bar of an explicit solve."""
+        self._bar.update(self._task, completed=fraction, description=f"{steps} increments of {increment:.2g} s")
+
 
 class FitProgress:
     """Shows what a fit has done so far on a terminal or in a notebook; silent elsewhere."""
@@ -67,4 +71,8 @@ class FitProgress:
 
     def show(self, step: int, loss: float, inner: int) -> None:
         """Update the line."""
-        self._bar.update(self._task, description=f"step {step}, misfit {loss:.5g}, {inner} inner iterations")
+        self._bar.update(self._task, description=f"solve {step}, misfit {loss:.5g}, {inner} inner iterations")
+
+    def drawn(self, count: int, draws: int) -> None:
+        """Update the line while the posterior is drawn from."""
+        self._bar.update(self._task, description=f"draw {count} of {draws} of the posterior")

@@ -64,7 +64,7 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         "min_volume_ratio": forces.smallest_J,
     }
     top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
-    return Fields(sample, window, _thickness(problem, u, load), top, stats)
+    return Fields(sample, window, deformed_thickness(problem, u, load), top, stats)
 
 
 def _face(
@@ -79,10 +79,7 @@ def _face(
     def filled(values):
         return filled_vertices(values, cells)
 
-    force, area = filled(force), filled(nodal_area_vector(x, cells))
-    outward = area if body == "sample" else -area
-    pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
-    traction = force / filled(tributary_area(X, cells))
+    pressure, traction = per_area(problem, body, u, force)
     zero = jnp.zeros((), x.dtype)
     if face is None:
         sticks = support == "bonded"
@@ -114,7 +111,23 @@ def _face(
     return FaceResult(pressure, traction, slip, status), stats
 
 
-def _thickness(problem: Problem, u: Array, load: Load) -> ThicknessMap:
+def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Array, Array]:
+    """Turn nodal forces [N] of a body into pressure on the current area and traction per reference area [MPa].
+
+    Args:
+        problem: The discrete problem.
+        body: Which face they act on.
+        u: Displacement of that face [mm], `(3, ny+1, nx+1)`.
+        force: On the layer, same shape.
+    """
+    cells, X = problem.body.cells.name, problem.positions[:, 0 if body == "window" else -1]
+    force, area = (filled_vertices(values, cells) for values in (force, nodal_area_vector(X + u, cells)))
+    outward = area if body == "sample" else -area
+    pressure = -jnp.sum(force * outward, axis=0) / jnp.sum(outward**2, axis=0)
+    return pressure, force / filled_vertices(tributary_area(X, cells), cells)
+
+
+def deformed_thickness(problem: Problem, u: Array, load: Load) -> ThicknessMap:
     """Read the deformed interface at the load's grid points, or at the mesh's own."""
     X = problem.positions[:, -1]
     if isinstance(load, Imprint):

@@ -1,19 +1,22 @@
 """What a solve returns: fields, status and statistics."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float, Int
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from ..measurement import ThicknessMap
 from ..model import Load, Palpation
 from .equilibrium import State
+from .explicit_step import Motion
 
 OPEN, STICK, SLIP = 0, 1, 2
 
 
 class RESULTS(eqx.Enumeration):
-    """How a solve ended. Anything but `successful` and `slides_off` leaves NaN fields."""
+    """How a solve ended. Anything but what `CONVERGED` names leaves NaN fields."""
 
     successful = ""
     slides_off = (
@@ -28,7 +31,27 @@ class RESULTS(eqx.Enumeration):
         "Newton.max_increments were tried before the load was reached. Raise it, or smooth the map; "
         "last_converged holds the last state."
     )
+    kinetic_energy_high = (
+        "Solved, but not quasi-statically: kinetic energy was above 1% of all energy after the first tenth of the "
+        "duration, stats['kinetic_ratio']. Raise Explicit.duration, or lower mass_scaling."
+    )
+    energy_drifts = (
+        "The energies do not add up: stats['energy_drift'] of the largest one is missing. The increment is too long: "
+        "lower Explicit.safety or increment."
+    )
+    element_inverted = (
+        "An element inverted. Smooth the map (smoothed(fwhm=...)), raise Explicit.duration, or lower Explicit.safety."
+    )
     nonfinite = "The inputs lead to NaN or infinite forces. Check the map, the thickness and the material."
+
+
+CONVERGED = ("successful", "slides_off", "kinetic_energy_high")
+"""How a solve ends that has reached its load."""
+
+
+def is_failure(result: RESULTS) -> Bool[Array, ""]:
+    """Tell whether a solve has not reached its load."""
+    return ~functools.reduce(jnp.logical_or, [result == getattr(RESULTS, name) for name in CONVERGED])
 
 
 class FaceResult(eqx.Module):
@@ -58,7 +81,7 @@ class LastConverged(eqx.Module):
 
     displacement: Float[Array, "3 mz my mx"]
     load_fraction: Float[Array, ""]
-    state: State
+    state: State | Motion
 
 
 class Solution(eqx.Module):

@@ -1,4 +1,6 @@
-"""`solve`: a palpation under a load, by implicit statics."""
+"""`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,17 +12,18 @@ from ..model import Load, Palpation
 from .derivative import follow_path
 from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
+from .explicit import Explicit, solve_explicit
 from .newton import Newton
 from .progress import LoadProgress
 from .recover import recover
-from .solution import RESULTS, ConvergenceError, LastConverged, Solution
+from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
 
 def solve(
     palpation: Palpation,
     load: Load,
-    solver: Newton = Newton(),
+    solver: Newton | Explicit = Newton(),
     *,
     throw: bool = True,
     start: Solution | None = None,
@@ -31,7 +34,7 @@ def solve(
     Args:
         palpation: The experiment.
         load: `Imprint`, `Traction` or `Displacement`.
-        solver: Method and settings.
+        solver: Method and settings: `Newton` (implicit statics) or `Explicit` (dynamics).
         throw: Raise where the solve fails. False: return NaN fields, the status in `result`
             and the last converged state in `last_converged`.
         start: Continue from this solution, with its friction history.
@@ -49,12 +52,18 @@ def solve(
         ValueError: If load and palpation contradict each other, or numbers are float32.
         ConvergenceError: If the solve fails and `throw` is True.
     """
+    if isinstance(solver, Explicit):
+        check_compatible(palpation, load, None if start is None else start.load)
+        solution = solve_explicit(palpation, load, solver, start, progress)
+        return _raise_on_failure(solution, _is_traced(solution)) if throw else solution
     require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
     first = None if start is None else start.last_converged.state
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((palpation, load, load_start, first, solver)))
+    if first is not None and not isinstance(first, State):
+        raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
+    traced = _is_traced((palpation, load, load_start, first, solver))
     problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
     run = _run_differentiable if traced else _run_with_progress
     stepping = run(problem, initial, solver, progress)
@@ -156,8 +165,12 @@ def _finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> 
     )
 
 
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
-    failed = (solution.result != RESULTS.successful) & (solution.result != RESULTS.slides_off)
+    failed = is_failure(solution.result)
     if traced:
         return solution.result.error_if(solution, failed)
     if bool(failed):

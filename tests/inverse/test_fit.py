@@ -1,5 +1,8 @@
 """The traction fit on data of its own model: it finds the truth, and knows how well."""
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 import opfem as op
 from opfem.inverse.forward import press
 from opfem.inverse.observation import _spline_values, interface_heights
+from opfem.mechanics.face import tributary_area
 from opfem.solvers.derivative import follow_path
 from opfem.solvers.discretise import discretise
 from opfem.solvers.stepping import attempt, begin, unfinished
@@ -114,7 +118,110 @@ def test_errors_say_what_to_do():
     bonded = op.Palpation(palpation().layer, (SIDE, SIDE), ELEMENTS, palpation().window, op.Bonded())
     with pytest.raises(ValueError, match=r"sample=Contact\(law, friction\), got sample=Bonded"):
         op.fit_traction(bonded, thickness, PRIOR)
-    with pytest.raises(ValueError, match=r"Matern\.length \[mm\].*element"):
-        op.fit_traction(palpation(), thickness, op.Matern(0.05, 1e-3))
-    with pytest.raises(ValueError, match="at least 4 elements"):
-        op.fit_traction(palpation((3, 12, 2)), thickness, PRIOR)
+    noisy = eqx.tree_at(lambda m: m.std, thickness, jnp.asarray(NOISE), is_leaf=lambda leaf: leaf is None)
+
+    def refused(message, thickness=noisy, experiment=palpation(), prior=PRIOR, **options):
+        with pytest.raises(ValueError, match=message):
+            op.fit_traction(experiment, thickness, prior, **options)
+
+    refused(r"Matern\.length \[mm\].*element", prior=op.Matern(0.05, 1e-3))
+    refused("at least 4 elements", experiment=palpation((3, 12, 2)))
+    refused("hexahedra", experiment=dataclasses.replace(palpation(), element="tet10"))
+    refused(r"parameters name numbers .* got 'c10'", parameters={"c10": op.Normal(1.0, 0.1)})
+    refused("forces needs one for each of 1 maps, got 2", forces=[op.ForceReading(1.0, 0.1)] * 2)
+    beside = op.ThicknessMap(np.full((11, 11), 0.45), extent=(SIDE, SIDE), std=NOISE, origin=(5.0, 0.0))
+    refused("map 0 has no pixel with data on the layer", thickness=beside)
+    other = op.ThicknessMap(np.full((9, 11), 0.45), extent=(SIDE, SIDE), std=NOISE)
+    refused("one grid of pixels", thickness=[noisy, other])
+
+
+@pytest.mark.parametrize("std", [0.0, -1e-3])
+def test_noise_must_be_positive(std):
+    with pytest.raises(ValueError, match=r"std.*positive|positive.*std"):
+        op.fit_traction(
+            palpation(), op.ThicknessMap(np.full((11, 11), 0.45), extent=(SIDE, SIDE), std=std), PRIOR, progress=False
+        )
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A quick problem: 6 × 6 × 2 elements, two increments; its truth, map and prior."""
+    experiment, settings = palpation((6, 6, 2)), op.Newton(increments=2, max_path=5, rtol=1e-9)
+    prior = op.Matern(length=0.6, std=1e-3, mean=3e-3)
+    known = 3e-3 + prior.expand(jax.random.normal(jax.random.key(3), (7, 7)), experiment.mesh().spacing)
+    return experiment, settings, prior, known
+
+
+def small_map(small, seed=0, load=1.0, mask=None):
+    experiment, settings, _, known = small
+    u = op.solve(experiment, op.Traction(load * known), settings).displacement[:, -1]
+    basis, _ = _spline_values(jnp.linspace(0.0, 6.0, 31), 6)
+    heights = basis @ interface_heights(experiment.mesh(), u) @ basis.T
+    noise = NOISE * np.random.default_rng(seed).standard_normal(heights.shape)
+    return op.ThicknessMap(heights + noise, extent=(SIDE, SIDE), std=NOISE, mask=mask)
+
+
+@pytest.mark.slow
+def test_derivative_of_the_fitted_traction_through_the_optimum(small):
+    experiment, settings, prior, _ = small
+    thickness = small_map(small)
+    fit = op.fit_traction(experiment, thickness, prior, solver=settings, draws=1)
+    weights = jax.random.normal(jax.random.key(0), (7, 7))
+    change = jax.random.normal(jax.random.key(1), thickness.shape)
+
+    @jax.jit
+    def functional(values, length, std):
+        moved = eqx.tree_at(lambda m: m.values, thickness, values)
+        return 1e3 * jnp.sum(weights * op.refitted(fit, moved, op.Matern(length, std, mean=3e-3)))
+
+    at = (thickness.values, 0.6, 1e-3)
+    assert functional(*at) == pytest.approx(1e3 * float(jnp.sum(weights * fit.normal)), rel=2e-3)
+    slopes = jax.jit(jax.grad(functional, argnums=(0, 1, 2)))(*at)
+    for slope, direction, h in (
+        (jnp.sum(slopes[0] * change), (change, 0.0, 0.0), 1e-5),
+        (slopes[1], (0.0, 1.0, 0.0), 1e-4),
+        (slopes[2], (0.0, 0.0, 1.0), 1e-6),
+    ):
+        ahead, behind = (functional(*(a + s * h * d for a, d in zip(at, direction, strict=True))) for s in (1.0, -1.0))
+        assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-3)
+
+
+@pytest.mark.slow
+def test_friction_and_modulus_from_three_maps_and_forces(small):
+    experiment, settings, prior, known = small
+    loads = (0.5, 1.0, 1.5)
+    maps = [small_map(small, seed, load) for seed, load in enumerate(loads)]
+    area = tributary_area(experiment.mesh().positions()[:, -1])
+    readings = [op.ForceReading(f, 0.01 * f) for f in (float(jnp.sum(load * known * area)) for load in loads)]
+    truth = {"window.friction": 0.15, "layer.material.c10": 2.23e-3}
+    parameters = {name: op.LogNormal(0.8 * value, 0.5) for name, value in truth.items()}
+    wide = op.Matern(prior.length, 2e-3, mean=3e-3)
+    fit = op.fit_traction(
+        experiment, maps, wide, parameters=parameters, forces=readings, solver=settings, draws=2, progress=False
+    )
+    assert fit.pressure.shape == (3, 7, 7)
+    assert fit.draws(jax.random.key(0), 2).shape == (2, 3, 7, 7)
+    for name, (low, high) in fit.number_intervals(0.99).items():
+        assert low < truth[name] < high
+        # The data tell: the interval is well inside the prior's.
+        assert np.log(high / low) < 0.6 * 2 * 2.58 * 0.5
+    total = jnp.sum(fit.normal * area, axis=(1, 2))
+    assert total == pytest.approx(np.array([float(r.force) for r in readings]), rel=0.02)
+
+
+@pytest.mark.slow
+def test_missing_pixels_and_a_sample_that_does_not_touch(small):
+    experiment, settings, prior, known = small
+    missing = np.random.default_rng(0).random((31, 31)) < 0.3
+    fit = op.fit_traction(experiment, small_map(small, mask=missing), prior, solver=settings, draws=4, progress=False)
+    assert fit.result == op.FitStatus.successful
+    assert jnp.linalg.norm(fit.normal - known) < 0.2 * jnp.linalg.norm(known - known.mean())
+    assert 0.3 < fit.reduced_chi2 < 2.0
+
+    free = op.ThicknessMap(np.full((31, 31), 0.52), extent=(SIDE, SIDE), std=NOISE)
+    with pytest.raises(op.FitError, match="nonnegative=True"):
+        op.fit_traction(experiment, free, op.Matern(0.6, 1e-3), solver=settings, draws=1, progress=False)
+    kept = op.fit_traction(
+        experiment, free, op.Matern(0.6, 1e-3), nonnegative=True, solver=settings, draws=1, throw=False, progress=False
+    )
+    assert bool(kept.result != op.FitStatus.successful) or (kept.normal.min() >= 0 and kept.reduced_chi2 > 10)

@@ -97,6 +97,18 @@ def test_noise_that_is_correlated_counts_for_less(mesh):
     assert 0.75 * truth.size < np.mean(totals) < 1.02 * truth.size
 
 
+def test_error_of_the_model_counts_once_per_element(mesh):
+    """Whatever the pixels: heights that are off by 1 µm from node to node, under pixels that are far surer."""
+    truth = jnp.asarray(surface(*mesh.plane()))
+    rng = np.random.default_rng(3)
+    for shape in ((161, 201), (81, 101)):
+        x, y = pixels(shape)
+        seen = observe(mesh, measured(surface(x, y)), 1e-5, model_std=1e-3)
+        totals = [float(jnp.sum(seen.misfit(truth + 1e-3 * rng.standard_normal(truth.shape)) ** 2)) for _ in range(20)]
+        # Splines between nodes hold less power than their values at them.
+        assert 0.5 * truth.size < np.mean(totals) < truth.size
+
+
 def test_interface_is_seen_at_deformed_places(mesh):
     x, y = mesh.plane()
     ux, uy = 0.1 * np.sin(x) * np.cos(0.5 * y), 0.05 * np.cos(y) + 0.02 * x

@@ -89,3 +89,31 @@ def test_errors_name_field_and_unit():
         op.Tikhonov(1, 0.0)
     with pytest.raises(ValueError, match=r"Matern\.mean \[MPa\].*\(17, 21\).*\(3, 3\)"):
         on_nodes(op.Matern(0.2, 1e-3, mean=np.zeros((3, 3))), SHAPE)
+
+
+def test_total_variation_is_quadratic_where_smooth_and_counts_the_height_of_an_edge():
+    weight, slope = 30.0, 2e-3
+    prior = op.TotalVariation(weight, slope)
+
+    def energy(field):
+        white = prior.whiten(jnp.asarray(field), SPACING)
+        return 0.5 * sum(float(jnp.sum(part**2)) for part in prior.held(white, SPACING))
+
+    width, height = SPACING[0] * (SHAPE[1] - 1), SPACING[1] * (SHAPE[0] - 1)
+    gentle = 0.02 * slope
+    quadratic = 0.5 * weight / slope * gentle**2 * width * height
+    assert energy(gentle * X) == pytest.approx(quadratic, rel=1e-3)
+    step = 0.05  # MPa within one element: 100 times the slope
+    one, two = (energy(step * (X > 2.4)), energy(0.5 * step * (X > 2.4) + 0.5 * step * (X > 3.6)))
+    edge = weight * height * (step - slope * SPACING[0])
+    assert one == pytest.approx(edge, rel=0.01)
+    # Two edges of half the height cost as much as one.
+    assert two == pytest.approx(one, rel=0.02)
+
+
+def test_total_variation_sees_a_checkerboard():
+    prior = op.TotalVariation(30.0, 2e-3)
+    rows, columns = np.indices(SHAPE)
+    field = 1e-4 * (-1.0) ** (rows + columns)
+    slopes, _ = prior.held(prior.whiten(jnp.asarray(field), SPACING), SPACING)
+    assert jnp.min(jnp.sum(slopes**2, axis=(0, 1))) > 0

@@ -98,6 +98,7 @@ def test_jit_equals_eager(frictional):
     np.testing.assert_allclose(solved, frictional.pressure, rtol=SOLVER, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ogden_with_exponents_2_and_minus_2_is_mooney_rivlin(frictional):
     ogden = op.Ogden(mu=[2 * 2.2e-3, 2 * 7.03e-4], alpha=[2.0, -2.0], bulk=0.11612)
     solved = op.solve(palpation(material=ogden), op.Imprint(bumpy()))

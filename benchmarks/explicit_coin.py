@@ -1,0 +1,177 @@
+"""The published decks by explicit dynamics and by implicit statics: maps, forces, energies, time.
+
+Run `python -m benchmarks.explicit_coin SHARED [--case smooth smooth-frictionless sharp sin] [--duration 1 2]
+[--precision float32 float64]`. SHARED holds data/decks and reference/ccx. Prints one JSON line per run.
+
+`sharp` is fQOCE_validate_coin_t1_125um as published, its rigid surface made of facets; `smooth` is the same with the
+surface of the stored CalculiX case; `sin` is fQOCE_sol_sin_t2, a preload and an actuation by µm that continues it.
+Both solvers integrate contact at the nodes; the deck's D=0 is K/µ = 20. Displacements of the deck's second step are
+taken as moves from where the first one ends.
+"""
+
+import argparse
+import json
+import resource
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import opfem as op
+
+from .friction_decks import K_OVER_MU, keywords
+
+NODES = 57  # of the imprint along a side, 0.125 mm apart, from -1 to 6 mm
+L0 = 0.5  # mm
+
+
+def imprint_steps(path: Path) -> list[np.ndarray]:
+    """Read the imprint's u_z [mm] of every step of a deck, `(57, 57)`, and what it is fixed by."""
+    steps = []
+    for keyword in keywords(path):
+        moves = [row for row in keyword.rows if "impAssembly." in row[0] and row[0].split(".")[-1].isdigit()]
+        if keyword.name == "BOUNDARY" and moves:
+            values = np.array([float(row[3]) for row in moves])
+            steps.append(values[: NODES**2].reshape(NODES, NODES))
+    return steps
+
+
+def material(path: Path) -> op.MooneyRivlin:
+    """Read the layer's material of a deck."""
+    c10, c01, _ = next(keyword.numbers() for keyword in keywords(path) if keyword.name == "HYPERELASTIC")
+    return op.MooneyRivlin(c10, c01, bulk=K_OVER_MU * 2.0 * (c10 + c01))
+
+
+def experiment(path: Path, frictionless: bool) -> op.Palpation:
+    """State a deck."""
+    frictions = [keyword.numbers()[0] for keyword in keywords(path) if keyword.name == "FRICTION"]
+    sample, window = (0.0, 0.0) if frictionless else frictions
+    return op.Palpation(
+        op.Layer(L0, material(path)),
+        extent=(5.0, 5.0),
+        elements=(40, 40, 4),
+        window=op.Contact(op.HardOverclosure(), window),
+        sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), sample),
+    )
+
+
+def surface(uz: np.ndarray, interpolation: str) -> op.Imprint:
+    """State the rigid surface."""
+    loaded = op.ThicknessMap(L0 + uz, extent=(7.0, 7.0), origin=(-1.0, -1.0))
+    return op.Imprint(loaded, interpolation=interpolation)
+
+
+def cases(shared: Path, name: str) -> tuple[op.Palpation, list[op.Imprint], float]:
+    """State a case: the experiment, its steps, and the deck's mass scaling."""
+    decks = shared / "data" / "decks"
+    coin = decks / "fQOCE_validate_coin_t1_125um.inp.gz"
+    if name == "sin":
+        deck = decks / "fQOCE_sol_sin_t2.inp.gz"
+        first, second = imprint_steps(deck)
+        return experiment(deck, False), [surface(first, "bilinear"), surface(first + second, "bilinear")], 5.0
+    if name == "sharp":
+        return experiment(coin, False), [surface(uz, "bilinear") for uz in imprint_steps(coin)], 25.0
+    stored = shared / "reference" / "ccx" / "cases" / "smoothcoin_muwin0p15_mutop0p05_C3D8.npz"
+    with np.load(stored) as case:
+        nodes, values = case["imprint_nodes"][: NODES**2], case["imprint_uz"][: NODES**2]
+    uz = np.zeros((NODES, NODES))
+    uz[tuple(np.rint((nodes[:, k] + 1.0) / 0.125).astype(int) for k in (1, 0))] = values
+    return experiment(coin, name == "smooth-frictionless"), [surface(uz, "cubic")], 25.0
+
+
+def relative(values, reference) -> float:
+    """Compute the relative L2 distance."""
+    return float(np.linalg.norm(np.asarray(values) - reference) / np.linalg.norm(reference))
+
+
+def run(palpation: op.Palpation, steps: list[op.Imprint], solver) -> tuple[list[op.Solution], list[float]]:
+    """Solve the steps one after the other."""
+    solutions, seconds = [], []
+    for load in steps:
+        begin = time.perf_counter()
+        start = solutions[-1] if solutions else None
+        solutions.append(op.solve(palpation, load, solver, throw=False, start=start, progress=False))
+        jax.block_until_ready(solutions[-1].pressure)
+        seconds.append(round(time.perf_counter() - begin, 2))
+    return solutions, seconds
+
+
+def describe(solution: op.Solution, reference: op.Solution | None) -> dict:
+    """Describe a solution, and its distance from the implicit one."""
+    stats = {name: np.asarray(value) for name, value in solution.stats.items()}
+    record = {
+        "message": op.RESULTS[solution.result],
+        "force_N": -float(stats["force_sample"][2]),
+        "increments": int(stats["increments"]),
+        "min_volume_ratio": float(stats["min_volume_ratio"]),
+        "max_penetration_um": 1e3 * float(stats["max_penetration"]),
+    }
+    if "kinetic_ratio" in stats:
+        record |= {
+            "increment_s": float(stats["increment"]),
+            "kinetic_ratio": float(stats["kinetic_ratio"]),
+            "energy_drift": float(stats["energy_drift"]),
+            "residual": float(stats["residual"]),
+            "energies_Nmm": {
+                name.removeprefix("energy_"): float(stats[name][-1])
+                for name in stats
+                if name.startswith("energy_") and name != "energy_drift"
+            },
+        }
+    if reference is not None:
+        inner = (slice(1, -1), slice(1, -1))
+        own, other = np.asarray(solution.pressure), np.asarray(reference.pressure)
+        record |= {
+            "force_from_reference": record["force_N"] / -float(reference.stats["force_sample"][2]) - 1.0,
+            "map_from_reference": relative(own, other),
+            "map_inside_from_reference": relative(own[inner], other[inner]),
+            "stress_zz_from_reference": relative(solution.stress_zz, np.asarray(reference.stress_zz)),
+            "displacement_from_reference": relative(solution.displacement, np.asarray(reference.displacement)),
+        }
+    return record
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("shared", type=Path)
+    parser.add_argument("--case", nargs="+", default=["smooth", "smooth-frictionless", "sharp", "sin"])
+    parser.add_argument("--duration", type=float, nargs="+", default=[1.0])
+    parser.add_argument("--precision", nargs="+", default=["float32"], choices=("float32", "float64"))
+    parser.add_argument("--no-implicit", action="store_true")
+    chosen = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    for name in chosen.case:
+        palpation, steps, mass_scaling = cases(chosen.shared, name)
+        implicit, first = None, None
+        if not chosen.no_implicit:
+            implicit, seconds = run(palpation, steps, op.Newton(face_rule="nodes"))
+            for k, solution in enumerate(implicit):
+                record = {"case": name, "solver": "Newton", "step": k, "seconds": seconds[k]}
+                print(json.dumps(record | describe(solution, None)), flush=True)
+        for duration in chosen.duration:
+            for precision in chosen.precision:
+                single = "float32" if precision == "float32" else None
+                settings = op.Explicit(duration=duration, mass_scaling=mass_scaling, precision=single)
+                solutions, seconds = run(palpation, steps, settings)
+                first = first or solutions
+                for k, solution in enumerate(solutions):
+                    record = {"case": name, "solver": "Explicit", "step": k, "duration_s": duration}
+                    record |= {"precision": precision, "seconds": seconds[k]}
+                    record |= describe(solution, None if implicit is None else implicit[k])
+                    record["map_from_first_run"] = relative(solution.pressure, np.asarray(first[k].pressure))
+                    if k > 0:  # what phase-sensitive OCT sees of the actuation
+                        moves = [
+                            np.asarray(s[k].displacement[2] - s[k - 1].displacement[2])
+                            for s in (solutions, implicit)
+                            if s is not None
+                        ]
+                        record["axial_move_um"] = [1e3 * float(moves[0].min()), 1e3 * float(moves[0].max())]
+                        if implicit is not None:
+                            record["axial_move_from_reference"] = relative(moves[0], moves[1])
+                    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+                    print(json.dumps(record | {"peak_MB": round(peak / 1024)}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,355 @@
+"""The traction fit held against truth: accuracy, calibration, cost, edges, parameters.
+
+Run `python -m benchmarks.traction_fit CASE`, CASE one of
+
+- `truth`: data from quadratic tetrahedra on a mesh 1.8 times finer, not nested, friction on both sides, 2 µm noise;
+  the fit beside the imprint route, the linear and the uniaxial estimate;
+- `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3]`: Jacobian products, with and without preconditioner;
+- `coin MAP`: the published coin, or the map simulated from its own fit;
+- `coverage [--fits 400] [--first 0]`: truths drawn from the prior on 12 × 12 × 2, one functional each;
+- `edge`: a step of pressure, its edge-spread width against mesh, noise and prior;
+- `parameters [--fits 100]`: window friction and C10 from three maps and readings of the force.
+
+Each prints JSON lines.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+
+import opfem as op
+from opfem.inverse.gauss_newton import least_squares
+from opfem.inverse.observation import interface_heights
+
+C10, C01, BULK = 2.23e-3, 7.03e-4, 0.11732  # MPa
+NOISE = 2e-3  # mm
+THICKNESS = 0.5  # mm
+ELEMENT = 0.125  # mm
+
+
+def experiment(
+    elements: tuple[int, int, int],
+    side: float,
+    window: float = 0.15,
+    sample: float = 0.05,
+    element: str = "mean_dilatation",
+    c10: float = C10,
+) -> op.Palpation:
+    """State the published layer on a square field."""
+    return op.Palpation(
+        op.Layer(THICKNESS, op.MooneyRivlin(c10=c10, c01=C01, bulk=BULK)),
+        extent=(side, side),
+        elements=elements,
+        window=op.Contact(op.HardOverclosure(), window),
+        sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), sample),
+        element=element,
+    )
+
+
+def surface(palpation: op.Palpation, solution: op.Solution, pixels: int) -> np.ndarray:
+    """Look at a solved interface on a grid of pixels [mm]."""
+    mesh = palpation.mesh()
+    heights = interface_heights(mesh, solution.displacement[:, -1])
+    x, y = (np.asarray(part) for part in mesh.plane())
+    place = np.linspace(0.0, float(mesh.extent[0]), pixels)
+    return RectBivariateSpline(y[:, 0], x[0], np.asarray(heights))(place, place)
+
+
+def as_map(heights: np.ndarray, side: float, seed: int, mask: np.ndarray | None = None) -> op.ThicknessMap:
+    """Add noise."""
+    noise = NOISE * np.random.default_rng(seed).standard_normal(heights.shape)
+    return op.ThicknessMap(heights + noise, extent=(side, side), std=NOISE, mask=mask)
+
+
+def error(p: jnp.ndarray, truth: jnp.ndarray) -> dict[str, float]:
+    """Compare with a truth: over its own variation, and over its size."""
+    off = float(jnp.linalg.norm(p - truth))
+    return {
+        "over_variation": round(off / float(jnp.linalg.norm(truth - truth.mean())), 4),
+        "relative_L2": round(off / float(jnp.linalg.norm(truth)), 4),
+    }
+
+
+def lobes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The pressure of `truth` [MPa]: two lobes and a valley on 3 kPa."""
+    return 1e-3 * (
+        3.0
+        + 4.0 * np.exp(-((x - 0.9) ** 2 + (y - 1.0) ** 2) / 0.18)
+        + 2.5 * np.exp(-((x - 1.8) ** 2 / 0.1 + (y - 1.6) ** 2 / 0.3))
+        - 1.5 * np.exp(-((x - 1.7) ** 2 + (y - 0.7) ** 2) / 0.12)
+    )
+
+
+def truth_case() -> None:
+    """No inverse crime (VALIDATION.md test 41)."""
+    side, fine, coarse = 2.5, experiment((36, 36, 6), 2.5, element="tet10"), experiment((20, 20, 4), 2.5)
+    known = op.solve(fine, op.Traction(lobes(*map(np.asarray, fine.mesh().plane()))))
+    measured = as_map(surface(fine, known, 151), side, seed=1)
+    truth = jnp.asarray(lobes(*map(np.asarray, coarse.mesh().plane())))
+    prior = op.Matern(length=0.5, std=1.5e-3, mean=3e-3)
+    begin = time.perf_counter()
+    first = op.fit_traction(coarse, measured, prior, draws=2)
+    seconds = time.perf_counter() - begin
+    model_std = jnp.sqrt(jnp.mean(op.mesh_error(first.solution) ** 2))
+    fit = op.fit_traction(coarse, measured, prior, model_std=model_std, draws=32)
+    imprint = op.solve(coarse, op.Imprint(measured.smoothed(fwhm=ELEMENT)))
+    linear, uniaxial = op.linear_estimate(coarse, measured, prior), op.uniaxial_estimate(coarse, measured)
+    inside = jnp.abs(fit.normal - truth) < 1.96 * fit.normal_std
+    print(
+        json.dumps(
+            {
+                "strain": round(1.0 - float(measured.values.min()) / THICKNESS, 3),
+                "fit": error(fit.normal, truth),
+                "without_model_std": error(first.normal, truth),
+                "model_std_um": round(1e3 * float(model_std), 2),
+                "imprint": error(-imprint.traction[2], truth),
+                "linear": error(linear.normal, truth),
+                "uniaxial": error(uniaxial, truth),
+                "inside_95": round(float(inside.mean()), 3),
+                "reduced_chi2": round(float(fit.reduced_chi2), 3),
+                "normal_std_kPa": round(1e3 * float(fit.normal_std.mean()), 3),
+                "resolution_mm": np.round(np.median(fit.resolution_width), 3),
+                "seconds": round(seconds, 1),
+                **counts(fit),
+            }
+        ),
+        flush=True,
+    )
+
+
+def counts(fit: op.TractionFit) -> dict[str, float]:
+    """Count what a fit took."""
+    return {
+        name: int(fit.stats[name])
+        for name in ("forward_solves", "gauss_newton_steps", "inner_iterations", "posterior_iterations", "draws")
+    }
+
+
+def prior_field(experiment: op.Palpation, prior: op.Matern, seed: int) -> jnp.ndarray:
+    """Draw a traction from the prior [MPa]."""
+    mesh = experiment.mesh()
+    return prior.mean + prior.expand(jax.random.normal(jax.random.key(seed), mesh.thickness.shape), mesh.spacing)
+
+
+def cost_case(elements: list[int], missing: float, block: float) -> None:
+    """Count products with the Jacobian, on maps of the fit's own model."""
+    for n in elements:
+        palpation = experiment((n, n, max(2, n // 10)), n * ELEMENT)
+        prior = op.Matern(length=0.6, std=1.5e-3, mean=3e-3)
+        truth = prior_field(palpation, prior, seed=5)
+        solution = op.solve(palpation, op.Traction(truth))
+        heights = surface(palpation, solution, 4 * n + 1)
+        rng = np.random.default_rng(2)
+        edge = int(np.sqrt(block) * heights.shape[0])
+        hole = np.zeros(heights.shape, bool)
+        hole[10 : 10 + edge, 10 : 10 + edge] = True
+        masks = {"none": None, "scattered": rng.random(heights.shape) < missing, "block": hole}
+        for name, mask in masks.items():
+            measured = as_map(heights, n * ELEMENT, seed=3, mask=mask)
+            seconds = []
+            for _ in range(2):
+                begin = time.perf_counter()
+                fit = op.fit_traction(palpation, measured, prior, draws=2)
+                seconds.append(round(time.perf_counter() - begin, 1))
+            begin = time.perf_counter()
+            jax.block_until_ready(op.solve(palpation, op.Traction(1.001 * truth), op.Newton(max_path=12)).pressure)
+            row = {
+                "elements": palpation.elements,
+                "missing": name,
+                "fit": error(fit.normal, truth),
+                "reduced_chi2": round(float(fit.reduced_chi2), 3),
+                "seconds": seconds,
+                "forward_seconds": round(time.perf_counter() - begin, 2),
+                "inner_per_step": round(int(fit.stats["inner_iterations"]) / int(fit.stats["gauss_newton_steps"]), 1),
+                "unpreconditioned_last_system": unpreconditioned(fit) if n <= 20 else None,
+                **counts(fit),
+            }
+            print(json.dumps(row), flush=True)
+
+
+def unpreconditioned(fit: op.TractionFit) -> int:
+    """Solve the first system of a posterior draw without preconditioner: iterations to 1e-2."""
+    posterior = fit.posterior
+
+    @eqx.filter_jit
+    def solve(posterior, noise):
+        J = posterior.jacobian
+        return least_squares(J.mv, J.T.mv, lambda r: r, noise, 1e-2, 1000).iterations
+
+    structure = posterior.residual_structure()
+    key = jax.random.key(0)
+    return int(solve(posterior, jax.tree.map(lambda s: jax.random.normal(key, s.shape, s.dtype), structure)))
+
+
+def coin_case(path: Path) -> None:
+    """The published coin, pressed to a part of its depth."""
+    loaded = op.read_thickness(path, extent=(5.0, 5.0), std=NOISE)
+    palpation = experiment((40, 40, 4), 5.0)
+    prior = op.Matern(length=0.3, std=4e-3, mean=op.uniaxial_estimate(palpation, loaded).mean())
+    for how in ("measured", "simulated"):
+        begin = time.perf_counter()
+        fit = op.fit_traction(palpation, loaded, prior, draws=8, throw=False)
+        imprint = op.solve(palpation, op.Imprint(loaded.smoothed(fwhm=0.06)), throw=False)
+        off = fit.pressure - imprint.pressure
+        row = {
+            "map": how,
+            "message": op.FitStatus[fit.result],
+            "force_N": -float(fit.solution.stats["force_sample"][2]),
+            "imprint_force_N": -float(imprint.stats["force_sample"][2]),
+            "reduced_chi2": float(fit.reduced_chi2),
+            "misfit_rms_um": 1e3 * float(fit.stats["misfit_rms"]),
+            "representation_rms_um": 1e3 * float(fit.stats["representation_rms"]),
+            "pressure_std_kPa": 1e3 * float(fit.pressure_std.mean()),
+            "difference_rms_kPa": 1e3 * float(jnp.sqrt(jnp.mean(off**2))),
+            "within_two_std": float(jnp.mean(jnp.abs(off) < 2.0 * fit.pressure_std)),
+            "seconds": round(time.perf_counter() - begin, 1),
+            **counts(fit),
+        }
+        print(json.dumps(row), flush=True)
+        if bool(fit.result != op.FitStatus.successful):
+            return
+        heights = surface(palpation, fit.solution, 161)
+        loaded = as_map(heights, 5.0, seed=4)
+
+
+def coverage_case(fits: int, first: int) -> None:
+    """Truths drawn from the prior (VALIDATION.md test 42): is a functional in its own interval, and at what rank?"""
+    side, prior, settings = 1.5, op.Matern(length=0.6, std=1.5e-3, mean=3e-3), op.Newton(increments=2, max_path=6)
+    palpation = experiment((12, 12, 2), side)
+    shape = palpation.mesh().thickness.shape
+    rows = []
+    for index in range(first, first + fits):
+        truth = prior_field(palpation, prior, seed=1000 + index)
+        solution = op.solve(palpation, op.Traction(truth), settings, throw=False, progress=False)
+        if bool(solution.result != op.RESULTS.successful) and bool(solution.result != op.RESULTS.slides_off):
+            print(json.dumps({"index": index, "not_carried": True}), flush=True)
+            continue
+        measured = as_map(surface(palpation, solution, 49), side, seed=index)
+        fit = op.fit_traction(palpation, measured, prior, solver=settings, draws=1, throw=False, progress=False)
+        weights = jax.random.normal(jax.random.key(5000 + index), shape) / np.sqrt(np.prod(shape))
+        std = float(jnp.sqrt(jnp.sum(weights * fit.covariance(weights))))
+        z = float(jnp.sum(weights * (truth - fit.normal))) / std
+        rows.append({"index": index, "z": z, "fitted": bool(fit.result == op.FitStatus.successful)})
+        print(json.dumps(rows[-1]), flush=True)
+    z = np.array([row["z"] for row in rows])
+    ranks = np.histogram(jax.scipy.stats.norm.cdf(z), bins=20, range=(0.0, 1.0))[0]
+    print(
+        json.dumps(
+            {
+                "fits": len(z),
+                "inside_95": float(np.mean(np.abs(z) < 1.96)),
+                "inside_90": float(np.mean(np.abs(z) < 1.645)),
+                "rank_chi2": float(np.sum((ranks - len(z) / 20) ** 2 / (len(z) / 20))),
+            }
+        ),
+        flush=True,
+    )
+
+
+def edge_case() -> None:
+    """A step of pressure: how wide does the fit make it?"""
+    for elements, side, noise_factor, length in (
+        ((40, 8, 4), 5.0, 1.0, 0.25),
+        ((80, 8, 8), 5.0, 1.0, 0.25),
+        ((80, 8, 8), 2.0, 1.0, 0.1),
+        ((80, 8, 8), 2.0, 1.0, 0.25),
+        ((80, 8, 8), 2.0, 0.1, 0.1),
+    ):
+        print(json.dumps(edge_width(elements, side, noise_factor, length)), flush=True)
+
+
+def edge_width(elements: tuple[int, int, int], side: float, noise_factor: float, length: float) -> dict:
+    """Fit a step of 2 to 6 kPa half-way along x; the width is from 10 to 90 % of its height."""
+    nx, ny, nz = elements
+    strip = side * ny / nx
+    palpation = eqx.tree_at(lambda p: p.extent, experiment(elements, side), jnp.array([side, strip]))
+    fine_elements = (2 * nx, ny, nz)
+    fine = eqx.tree_at(lambda p: p.extent, experiment(fine_elements, side), jnp.array([side, strip]))
+    x, _ = fine.mesh().plane()
+    solution = op.solve(fine, op.Traction(jnp.where(x < 0.5 * side, 2e-3, 6e-3)))
+    heights = interface_heights(fine.mesh(), solution.displacement[:, -1])
+    noise = noise_factor * NOISE
+    values = heights + noise * np.random.default_rng(0).standard_normal(heights.shape)
+    measured = op.ThicknessMap(values, extent=(side, strip), std=noise)
+    fit = op.fit_traction(palpation, measured, op.Matern(length=length, std=2e-3, mean=4e-3), draws=4, throw=False)
+    line = 1e3 * np.asarray(jnp.mean(fit.normal, axis=0))
+    place = np.linspace(0.0, side, nx + 1)
+    low, high = np.mean(line[place < 0.3 * side]), np.mean(line[place > 0.7 * side])
+    share = (line - low) / (high - low)
+    near = np.abs(place - 0.5 * side) < 0.3 * side
+    ends = [np.interp(level, share[near], place[near]) for level in (0.1, 0.9)]
+    return {
+        "element_um": 1e3 * side / nx,
+        "noise_um": 1e3 * noise,
+        "prior_length_mm": length,
+        "edge_10_90_um": round(1e3 * (ends[1] - ends[0]), 1),
+        "resolution_um": round(1e3 * float(np.median(fit.resolution_width)), 1),
+        "message": op.FitStatus[fit.result],
+        "reduced_chi2": round(float(fit.reduced_chi2), 3),
+    }
+
+
+def parameters_case(fits: int) -> None:
+    """Window friction and C10 from three maps and force readings of 1 % (same model)."""
+    side, settings = 1.5, op.Newton(increments=2, max_path=6)
+    palpation = experiment((8, 8, 2), side)
+    prior = op.Matern(length=0.6, std=1e-3, mean=3e-3)
+    pattern = prior_field(palpation, prior, seed=7)
+    area = side**2
+    loads = [part * pattern for part in (0.5, 1.0, 1.5)]
+    solutions = [op.solve(palpation, op.Traction(load), settings) for load in loads]
+    surfaces = [surface(palpation, solution, 33) for solution in solutions]
+    forces = [-float(solution.stats["force_sample"][2]) for solution in solutions]
+    known = {"window.friction": 0.15, "layer.material.c10": C10}
+    parameters = {name: op.LogNormal(0.8 * value, 0.5) for name, value in known.items()}
+    wide = op.Matern(length=0.6, std=2e-3, mean=3e-3)
+    inside = dict.fromkeys(known, 0)
+    for index in range(fits):
+        rng = np.random.default_rng(index)
+        maps = [as_map(heights, side, seed=100 * index + i) for i, heights in enumerate(surfaces)]
+        readings = [op.ForceReading(f * (1.0 + 0.01 * rng.standard_normal()), 0.01 * f) for f in forces]
+        fit = op.fit_traction(
+            palpation, maps, wide, parameters=parameters, forces=readings, solver=settings, draws=1, progress=False
+        )
+        intervals = fit.number_intervals()
+        for name, (low, high) in intervals.items():
+            inside[name] += low <= known[name] <= high
+        row = {"index": index, "values": {k: float(v) for k, v in fit.numbers.items()}, "intervals": intervals}
+        print(json.dumps(row | {"inside": inside, "area_mm2": area, **counts(fit)}), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("case", choices=("truth", "cost", "coin", "coverage", "edge", "parameters"))
+    parser.add_argument("map", type=Path, nargs="?", help="the coin's map")
+    parser.add_argument("--elements", type=int, nargs="+", default=[20, 40])
+    parser.add_argument("--missing", type=float, default=0.3)
+    parser.add_argument("--block", type=float, default=0.3)
+    parser.add_argument("--fits", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    chosen = parser.parse_args(sys.argv[1:])
+    jax.config.update("jax_enable_x64", True)
+    if chosen.case == "truth":
+        truth_case()
+    elif chosen.case == "cost":
+        cost_case(chosen.elements, chosen.missing, chosen.block)
+    elif chosen.case == "coin":
+        coin_case(chosen.map)
+    elif chosen.case == "coverage":
+        coverage_case(chosen.fits, chosen.first)
+    elif chosen.case == "edge":
+        edge_case()
+    else:
+        parameters_case(chosen.fits)
+
+
+if __name__ == "__main__":
+    main()

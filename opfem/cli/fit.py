@@ -1,0 +1,187 @@
+"""`opfem fit MAP --out DIR`: the traction that explains a measured thickness map, with its uncertainty."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+
+from ..compilation import cache_compilation
+from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
+from ..measurement import ThicknessMap
+from ..model import Palpation
+from ..results import summary, to_xarray
+from ..solvers import Newton
+from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions
+from .running import FINISHED, app, prepare, refuse_finished, reporting, write_files
+from .statement import read_maps, settings_of, show_assumptions, state_experiment
+
+FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", FINISHED)
+_ELEMENTS_PER_LENGTH = 3.0
+
+
+@app.command
+def fit(
+    map: Annotated[str, Parameter(name="MAP")],
+    /,
+    *,
+    out: Path,
+    reading: MapOptions = MapOptions(),
+    layer: LayerOptions = LayerOptions(),
+    contact: ContactOptions = ContactOptions(),
+    asked: FitOptions = FitOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Fit the traction on the sample to a measured thickness map, with its uncertainty.
+
+    Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
+    summary.json, pressure.png and fit.png.
+
+    Args:
+        map: Loaded thickness (.mat, .npy, .npz, .tif, .csv), or the word `example` for a built-in one.
+        out: Folder of the results.
+        reading: How to read the maps.
+        layer: The layer and its mesh.
+        contact: Contact with window and sample.
+        asked: The fit.
+        run: The run itself.
+    """
+    with reporting(run.debug):
+        jax.config.update("jax_enable_x64", True)
+        if run.keep_compiled:
+            cache_compilation()
+        refuse_finished(out, run.force)
+        if run.solver != "newton":
+            raise ValueError("opfem fit differentiates the implicit solver; leave out --solver explicit.")
+        measured, unloaded = read_maps(map, reading)
+        palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
+        prior = state_prior(palpation, load.thickness, asked)
+        settings = {**settings_of(map, reading, layer, contact, load), **_asked(asked, prior)}
+        prepare(out)
+        show_assumptions(palpation, measured, layer, contact)
+        Console(highlight=False).print(
+            f"  prior: pressure {1e3 * float(prior.mean):.3g} ± {1e3 * float(prior.std):.3g} kPa, correlated over "
+            f"{float(prior.length):.3g} mm; noise of the map as given"
+        )
+        fitted = fit_traction(
+            palpation,
+            measured,
+            prior,
+            parameters=_parameters(palpation, asked),
+            nonnegative=asked.nonnegative,
+            hyperparameters=asked.hyperparameters,
+            solver=Newton(max_path=12) if run.increments is None else Newton(increments=run.increments),
+            draws=asked.draws,
+        )
+        numbers = fit_summary(fitted)
+        # Loaded here, so that the help and a refused run do not wait for matplotlib.
+        from ..plot import draw_fit
+
+        dataset = to_xarray(fitted)
+        write_files(dataset, draw_fit(dataset, measured), {**numbers, "settings": settings}, FILES, out)
+        _show(numbers, out)
+
+
+def state_prior(palpation: Palpation, filled: ThicknessMap, asked: FitOptions) -> Matern:
+    """State what is known of the pressure; what was not given comes from the uniaxial estimate.
+
+    Args:
+        palpation: The experiment.
+        filled: Loaded thickness without missing pixels.
+        asked: What was given.
+    """
+    pressure = uniaxial_estimate(palpation, filled)
+    size = float(jnp.max(jnp.stack(palpation.mesh().spacing)))
+    return Matern(
+        length=_ELEMENTS_PER_LENGTH * size if asked.prior_length is None else asked.prior_length,
+        std=jnp.std(pressure) if asked.prior_std is None else asked.prior_std,
+        mean=jnp.mean(pressure) if asked.prior_mean is None else asked.prior_mean,
+    )
+
+
+def fit_summary(fitted: TractionFit) -> dict[str, Any]:
+    """Summarise a fit in types that JSON knows, every key with its unit.
+
+    Args:
+        fitted: A fit of one map.
+    """
+    stats = fitted.stats
+    return {
+        **summary(fitted.solution),
+        "pressure_std_mean_kPa": 1e3 * float(fitted.pressure_std.mean()),
+        "pressure_std_max_kPa": 1e3 * float(fitted.pressure_std.max()),
+        "pressure_std_error_percent": 100.0 * float(stats["std_error"]),
+        "reduced_chi2": float(fitted.reduced_chi2),
+        "effective_dof": float(fitted.effective_dof),
+        "observed_dof": float(fitted.observed),
+        "residual_rms_um": 1e3 * float(stats["misfit_rms"]),
+        "representation_rms_um": 1e3 * float(stats["representation_rms"]),
+        "resolution_um": [1e3 * float(width) for width in fitted.resolution_width],
+        "prior_length_mm": float(fitted.prior.length),
+        "prior_std_kPa": 1e3 * float(fitted.prior.std),
+        "fitted_numbers": {name: float(value) for name, value in fitted.numbers.items()},
+        "fitted_intervals_95_percent": {name: list(ends) for name, ends in fitted.number_intervals().items()},
+        "not_observed": {name: list(pair) for name, pair in fitted.unobserved().items()},
+        "forward_solves_count": int(stats["forward_solves"]),
+        "inner_iterations_count": int(stats["inner_iterations"]),
+    }
+
+
+def _parameters(palpation: Palpation, asked: FitOptions) -> dict[str, LogNormal]:
+    spreads = {
+        "window.friction": asked.friction_spread,
+        "sample.friction": asked.friction_spread,
+        "layer.material.c10": asked.modulus_spread,
+    }
+    medians = {
+        "window.friction": palpation.window.friction,
+        "sample.friction": palpation.sample.friction,
+        "layer.material.c10": palpation.layer.material.c10,
+    }
+    return {name: LogNormal(medians[name], spread) for name, spread in spreads.items() if spread is not None}
+
+
+def _asked(asked: FitOptions, prior: Matern) -> dict[str, Any]:
+    used = {name: float(getattr(prior, name)) for name in ("length", "std", "mean")}
+    return {**dataclasses.asdict(asked), **{f"prior_{name}": value for name, value in used.items()}}
+
+
+def _show(numbers: dict[str, Any], out: Path) -> None:
+    rows = [
+        ("force on the layer, normal", f"{-numbers['force_sample_N'][2]:.4g}", "N"),
+        ("mean pressure", f"{numbers['pressure_mean_kPa']:.3g}", "kPa"),
+        ("largest pressure", f"{numbers['pressure_max_kPa']:.3g}", "kPa"),
+        ("its standard deviation, mean", f"{numbers['pressure_std_mean_kPa']:.2g}", "kPa"),
+        ("resolution", f"{sorted(numbers['resolution_um'])[len(numbers['resolution_um']) // 2]:.0f}", "µm"),
+        ("χ² per degree of freedom", f"{numbers['reduced_chi2']:.2f}", ""),
+        (
+            "forward solves, inner iterations",
+            f"{numbers['forward_solves_count']}, {numbers['inner_iterations_count']}",
+            "",
+        ),
+        *(
+            (name, f"{value:.4g} ({low:.4g} to {high:.4g})", "")
+            for (name, value), (low, high) in zip(
+                numbers["fitted_numbers"].items(), numbers["fitted_intervals_95_percent"].values(), strict=True
+            )
+        ),
+    ]
+    table = Table("at the sample", "", "")
+    table.columns[1].justify = "right"
+    for row in rows:
+        table.add_row(*row)
+    console = Console(highlight=False)
+    console.print(table)
+    if not 0.5 < numbers["reduced_chi2"] < 2.0:
+        console.print(
+            "χ² per degree of freedom should be near 1: well above, the layer cannot explain the map (material, "
+            "friction, L0, mask) or its noise --std is larger than given; well below, the noise is smaller.",
+            style="yellow",
+        )
+    for name, (after, before) in numbers["not_observed"].items():
+        console.print(f"The map hardly tells: {name} ({after:.3g} after, {before:.3g} before the fit).", style="yellow")
+    console.print(f"Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)

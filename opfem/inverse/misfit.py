@@ -1,0 +1,163 @@
+"""What a fit minimises: misfit and priors, as a function of white unknowns."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..mechanics.face import nodal_area_vector, tributary_area
+from ..model import Palpation, Traction
+from ..solvers import Newton
+from .data import AxialDisplacement, ForceReading
+from .forward import press
+from .observation import Nodes, Observation, interface_heights
+from .parameters import INDEX, AbstractNumberPrior, with_numbers
+from .preconditioner import Unknowns
+from .prior import AbstractPrior, on_nodes
+
+# Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then halved.
+_NOT_CARRIED = 1e4
+# Weight [1/mm] of displacements that ride along among the residuals, so that products with the Jacobian give their
+# change too: it weighs nothing.
+_RIDES_ALONG = 1e-9
+
+
+class Misfit(eqx.Module):
+    """What a fit minimises, as a function of white unknowns.
+
+    Attributes:
+        palpation: The experiment, fitted numbers at their priors' centres.
+        observations: Of every map, stacked.
+        prior: Of the normal traction.
+        lateral: Of each component of the lateral traction; None: it follows friction.
+        parameters: Priors of fitted numbers, by name.
+        forces: Force readings, stacked; None without.
+        inside: Displacements inside the layer, stacked; None without.
+        softness: Pressure [MPa] below which a non-negative traction bends towards zero; None: any sign.
+        solver: Settings of the forward solve.
+    """
+
+    palpation: Palpation
+    observations: Observation
+    prior: AbstractPrior
+    lateral: AbstractPrior | None
+    parameters: dict[str, AbstractNumberPrior]
+    forces: ForceReading | None
+    inside: AxialDisplacement | None
+    softness: Array | None
+    solver: Newton
+
+    def experiment(self, white: Unknowns) -> Palpation:
+        """Put the fitted numbers into the experiment."""
+        return with_numbers(self.palpation, self.numbers(white))
+
+    def numbers(self, white: Unknowns) -> dict[str, Array]:
+        """Compute the fitted numbers."""
+        return {name: prior.number(white.numbers[name]) for name, prior in self.parameters.items()}
+
+    def normal(self, white: Unknowns) -> Float[Array, "maps my mx"]:
+        """Compute the normal tractions [MPa] per reference area."""
+        return self.latent_to_normal(self.latent(white))
+
+    def latent(self, white: Unknowns) -> Float[Array, "maps my mx"]:
+        """Compute what the prior speaks of [MPa]: the normal tractions, unless those are kept above zero."""
+        spacing = self.palpation.mesh().spacing
+        mean = on_nodes(self.prior, white.normal.shape[1:])
+        return mean + jax.vmap(lambda part: self.prior.expand(part, spacing))(white.normal)
+
+    def latent_to_normal(self, latent: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:
+        """Keep tractions above zero, where that is asked for."""
+        return latent if self.softness is None else self.softness * jax.nn.softplus(latent / self.softness)
+
+    def white(self, normal: Float[Array, "maps my mx"]) -> Unknowns:
+        """Find unknowns that give normal tractions [MPa], the others at their priors' centres."""
+        maps, *shape = normal.shape
+        if self.softness is not None:
+            # The inverse of softplus, from a little above zero.
+            ratio = jnp.maximum(normal / self.softness, 1e-2)
+            normal = self.softness * (ratio + jnp.log(-jnp.expm1(-ratio)))
+        spacing = self.palpation.mesh().spacing
+        deviation = normal - on_nodes(self.prior, tuple(shape))
+        lateral = None if self.lateral is None else jnp.zeros((maps, 2, *shape))
+        numbers = {name: jnp.zeros(()) for name in self.parameters}
+        return Unknowns(jax.vmap(lambda part: self.prior.whiten(part, spacing))(deviation), lateral, numbers)
+
+    def tractions(self, white: Unknowns) -> Traction:
+        """Compute the load of every map, stacked."""
+        if self.lateral is None or white.lateral is None:
+            return jax.vmap(Traction)(self.normal(white))
+        spacing, prior = self.palpation.mesh().spacing, self.lateral
+        lateral = jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
+        return jax.vmap(Traction)(self.normal(white), lateral)
+
+    def __call__(self, white: Unknowns, exact: bool = False) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Compute standardised residuals by source, and how the solves went; derivatives as `press` has them."""
+        palpation, numbers = self.experiment(white), self.numbers(white)
+        mesh, spacing = palpation.mesh(), palpation.mesh().spacing
+
+        def one(each):
+            observation, load = each
+            pressed = press(palpation, load, self.solver, exact)
+            heights = interface_heights(mesh, pressed.u[:, -1]) * numbers.get(INDEX, 1.0)
+            misfit = jnp.where(pressed.reached >= 1.0, observation.misfit(heights), _NOT_CARRIED)
+            return misfit, heights, pressed
+
+        loads = self.tractions(white)
+        misfit, heights, pressed = _one_by_one(one, (self.observations, loads))
+        residuals = {
+            "maps": misfit,
+            "prior": jax.vmap(lambda part: self.prior.held(part, spacing))(white.normal),
+            "numbers": white.numbers,
+            "rides": _RIDES_ALONG * pressed.u[:, :, -1],
+        }
+        if self.lateral is not None:
+            prior = self.lateral
+            residuals["lateral"] = jax.vmap(jax.vmap(lambda part: prior.held(part, spacing)))(white.lateral)
+        if self.forces is not None:
+            total = jnp.sum(loads.normal * tributary_area(mesh.positions()[:, -1]), axis=(1, 2))
+            residuals["forces"] = (total - self.forces.force) / self.forces.std
+        if self.inside is not None:
+            std = self.inside.std
+            std = std.reshape(std.shape + (1,) * (4 - std.ndim))
+            off = (pressed.u[:, 2] - self.inside.values) / std
+            residuals["inside"] = jnp.where(self.inside.mask, 0.0, off)
+        aux = {"carried": pressed.reached >= 1.0, "heights": heights, "newton": pressed.newton}
+        return residuals, aux
+
+
+def pressure_change(
+    palpation: Palpation, traction: Float[Array, "3 my mx"], u: Float[Array, "3 my mx"], change: Nodes, moved: Array
+) -> Nodes:
+    """Compute how the pressure on the current area changes with the normal traction and with where its points are.
+
+    Args:
+        palpation: The experiment.
+        traction: Force on the layer per reference area [MPa]; its lateral part keeps its ratio to the normal one.
+        u: Displacement of the interface [mm].
+        change: Of the normal traction [MPa].
+        moved: Change of the displacement [mm].
+    """
+    X = palpation.mesh().positions()[:, -1]
+    normal = -traction[2]
+    pushes = jnp.abs(normal) > 1e-12 * jnp.max(jnp.abs(normal))
+    direction = jnp.where(pushes, traction / jnp.where(pushes, normal, 1.0), jnp.array([0.0, 0.0, -1.0])[:, None, None])
+    area = tributary_area(X)
+
+    def pressure(normal, u):
+        outward = nodal_area_vector(X + u)
+        return -jnp.sum(direction * (normal * area) * outward, axis=0) / jnp.sum(outward**2, axis=0)
+
+    return jax.jvp(pressure, (normal, u), (change, moved))[1]
+
+
+def moved(residuals: dict[str, Any]) -> Float[Array, "maps 3 my mx"]:
+    """Take the interface's displacement, or its change [mm], from residuals or their change."""
+    return residuals["rides"] / _RIDES_ALONG
+
+
+def _one_by_one(function, stacked):
+    if jax.tree.leaves(stacked)[0].shape[0] == 1:
+        return jax.tree.map(lambda v: v[None], function(jax.tree.map(lambda v: v[0], stacked)))
+    return jax.lax.map(function, stacked)

@@ -1,0 +1,179 @@
+"""Kinematic contact of explicit dynamics: what a rigid body does to the nodes of a face within one increment.
+
+Pure master–slave: the rigid body leads, and the layer's nodes are moved from where they would be without contact to
+where the law holds at the end of the increment. The force is what this takes; no penalty, so that contact does not
+shorten the stable increment. The weight of a balanced pair (0.5 in the published decks) does not matter against a
+rigid body: it cannot be moved, so the pair is pure master–slave whatever its weight.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..mechanics.face import to_nodes
+from ..mechanics.interaction import ContactFace, RigidPatches
+from ..model import HardOverclosure
+
+Face = Float[Array, "my mx"]
+FaceVector = Float[Array, "3 my mx"]
+
+# Newton steps on the pressure equation; it starts at the last increment's clearance and gains a digit squared each.
+_PRESSURE_STEPS = 4
+# A node counts as slipping from this share of the largest friction, as in the implicit solver.
+_AT_LIMIT = 0.9
+
+
+class Work(NamedTuple):
+    """Energy [N mm] of one node so far: into contact, into friction, and done by the body's motion."""
+
+    contact: Face
+    friction: Face
+    external: Face
+
+
+class FaceMotion(eqx.Module):
+    """What the contact of one face carries from increment to increment.
+
+    Attributes:
+        clearance: Where the pressure equation starts [mm].
+        normal: Force of the body on the layer along the surface's normal [N].
+        friction: The tangential rest [N].
+        slip: Slip along x and y so far [mm].
+        slips: 1 where friction is at its limit, or within a tenth of it, else 0.
+        work: Energies of every node so far.
+    """
+
+    clearance: Face
+    normal: FaceVector
+    friction: FaceVector
+    slip: Float[Array, "2 my mx"]
+    slips: Face
+    work: Work
+
+    @property
+    def force(self) -> FaceVector:
+        """Force of the body on the layer [N]."""
+        return self.normal + self.friction
+
+
+class Travel(NamedTuple):
+    """The increment under way.
+
+    Attributes:
+        before: Load fraction at the start of the increment before.
+        start: At the start of this one.
+        end: At its end.
+        increment: Length of the increment [s].
+        share: The time in which its forces act, from the middle of the increment before to its own, over its length.
+    """
+
+    before: Array
+    start: Array
+    end: Array
+    increment: Array
+    share: Array
+
+
+def still(face: ContactFace, x: FaceVector) -> FaceMotion:
+    """Start a face that nothing touches yet."""
+    zero = jnp.zeros_like(x)
+    # The law is open there, so the first pressure equation starts from where the node would be.
+    clearance = jnp.full_like(x[0], 1.0) * face.contact.law.zero_pressure_clearance
+    return FaceMotion(clearance, zero, zero, zero[:2], zero[0], Work(*zero))
+
+
+def touch(
+    face: ContactFace,
+    motion: FaceMotion,
+    under: RigidPatches | None,
+    trial: FaceVector,
+    move: FaceVector,
+    last_move: FaceVector,
+    mobility: Face,
+    area: Face,
+    travel: Travel,
+) -> tuple[FaceVector, FaceMotion]:
+    """Move the nodes of a face to where contact holds at the end of the increment.
+
+    Args:
+        face: The contact.
+        motion: What it carries.
+        under: The body's surface around the nodes; None for the plane z = 0.
+        trial: Position at the end of the increment without contact [mm].
+        move: Displacement in it without contact [mm].
+        last_move: Displacement in it at the velocity of the increment before [mm].
+        mobility: Displacement per force within the increment [mm/N].
+        area: Current area of each node [mm²].
+        travel: How far the body has moved.
+
+    Returns:
+        What contact adds to the displacement, and what is carried on.
+    """
+    side = 1.0 if face.above else -1.0
+    zero = jnp.zeros_like(area)
+    height, slope_x, slope_y, lift = (zero,) * 4 if under is None else under.at(travel.end, trial[0], trial[1])
+    stretch = jnp.sqrt(1.0 + slope_x**2 + slope_y**2)
+    normal = jnp.stack([-slope_x, -slope_y, jnp.ones_like(slope_x)]) / stretch
+    if face.imposed is not None:  # a dead load pushes elsewhere; here it bounds friction
+        clearance, push = motion.clearance, imposed_force(face, travel.end, area.shape)
+        added = jnp.zeros_like(move)
+    else:
+        free = (side * (height - trial[2]) + face.offset) / stretch
+        clearance, push = _push(face, motion.clearance, free, mobility, area)
+        added = -side * (push * mobility) * normal
+    d = (move + added)[:2]
+    along = jnp.stack([d[0], d[1], slope_x * d[0] + slope_y * d[1]])
+    squared = jnp.sum(along**2, axis=0)
+    length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    limit = face.contact.friction * push * mobility  # as a displacement
+    share = jnp.where(squared > 0, jnp.minimum(limit / length, 1.0), 0.0)
+    added = added - share * along
+    normal_force = jnp.zeros_like(move) if face.imposed is not None else -side * push * normal
+    friction = -share * along / mobility
+    closed = push > 0
+    slips = (closed & (squared > 0) & (length > _AT_LIMIT * limit)).astype(push.dtype)
+    slip = motion.slip + jnp.where(closed, (1.0 - share) * d, 0.0)
+    moved = 0.5 * travel.share * (last_move + move + added)
+    lifted = 0.5 * lift * (travel.end - travel.before)
+    relative = jnp.stack([moved[0], moved[1], moved[2] - lifted])
+    work = Work(
+        contact=motion.work.contact - jnp.sum(normal_force * relative, axis=0),
+        friction=motion.work.friction - jnp.sum(friction * relative, axis=0),
+        external=motion.work.external + (normal_force[2] + friction[2]) * lifted,
+    )
+    return added, FaceMotion(clearance, normal_force, friction, slip, slips, work)
+
+
+def imposed_force(face: ContactFace, fraction: Array, shape: tuple[int, int]) -> Face:
+    """Compute the dead normal force of a node [N] that bounds its friction."""
+    assert face.imposed is not None
+    ny, nx = shape[0] - 1, shape[1] - 1
+    pressure = face.imposed.at_points(fraction, face.rule) * face.imposed.area
+    return to_nodes(pressure.reshape(-1, ny, nx), face.rule)
+
+
+def _push(face: ContactFace, guess: Face, free: Face, mobility: Face, area: Face) -> tuple[Face, Face]:
+    """Solve clearance = free + mobility · area · p(clearance) for the clearance and the normal force [N].
+
+    The right side falls and the left side rises, so there is one root. What is left after the last step is linear in
+    all but the clearance it starts from, so that the derivative is that of the root.
+    """
+    law = face.contact.law
+    if isinstance(law, HardOverclosure):
+        return free, jnp.maximum(-free, 0.0) / mobility
+    give = mobility * area
+
+    def newton(clearance):
+        pressure, slope = jax.jvp(lambda c: law.pressure(c, face.stiffness), (clearance,), (jnp.ones_like(clearance),))
+        slope = jax.lax.stop_gradient(slope)
+        after = clearance - (clearance - free - give * pressure) / (1.0 - jax.lax.stop_gradient(give) * slope)
+        return after, pressure + slope * (after - clearance)
+
+    clearance = jax.lax.stop_gradient(guess)
+    for _ in range(_PRESSURE_STEPS - 1):
+        clearance = jax.lax.stop_gradient(newton(clearance)[0])
+    clearance, pressure = newton(clearance)
+    return clearance, jnp.maximum(pressure, 0.0) * area

@@ -1,0 +1,38 @@
+"""What a mesh misses, estimated from half of it."""
+
+import numpy as np
+import pytest
+
+import opfem as op
+from opfem.inverse.observation import interface_heights
+
+# The estimate is of first order in a smaller error: halving once more leaves a sixteenth.
+OF_AN_ESTIMATE = 0.3
+
+
+def pressed(elements):
+    palpation = op.Palpation(
+        op.Layer(0.5, op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=0.11732)),
+        extent=(1.5, 1.5),
+        elements=elements,
+        window=op.Contact(op.HardOverclosure(), 0.15),
+        sample=op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.05),
+    )
+    x, y = (np.asarray(part) for part in palpation.mesh().plane())
+    bump = 1e-3 * (2.0 + 2.0 * np.exp(-((x - 0.7) ** 2 + (y - 0.8) ** 2) / 0.15))
+    return op.solve(palpation, op.Traction(bump))
+
+
+@pytest.mark.slow
+def test_half_the_mesh_tells_what_the_mesh_misses():
+    on_mesh, on_finer = pressed((8, 8, 2)), pressed((16, 16, 4))
+    heights = [interface_heights(s.palpation.mesh(), s.displacement[:, -1]) for s in (on_mesh, on_finer)]
+    # What is left of the finer mesh's own error is a quarter.
+    missed = (heights[0] - heights[1][::2, ::2])[::2, ::2] * 4.0 / 3.0
+    estimate = np.asarray(op.mesh_error(on_mesh))
+    assert np.linalg.norm(estimate - missed) < OF_AN_ESTIMATE * np.linalg.norm(missed)
+
+
+def test_other_loads_are_refused(solution):
+    with pytest.raises(ValueError, match="under a Traction, got Imprint"):
+        op.mesh_error(solution)
