@@ -73,6 +73,7 @@ def fit(
             prior,
             parameters=_parameters(palpation, asked),
             nonnegative=asked.nonnegative,
+            model_std=asked.model_std,
             hyperparameters=asked.hyperparameters,
             solver=Newton(max_path=12) if run.increments is None else Newton(increments=run.increments),
             draws=asked.draws,
@@ -179,7 +180,8 @@ def _show(numbers: dict[str, Any], out: Path) -> None:
     if not 0.5 < numbers["reduced_chi2"] < 2.0:
         console.print(
             "χ² per degree of freedom should be near 1: well above, the layer cannot explain the map (material, "
-            "friction, L0, mask) or its noise --std is larger than given; well below, the noise is smaller.",
+            "friction, L0, mask) or its noise --std is larger than given; well below, --std or --model-std is too "
+            "large.",
             style="yellow",
         )
     for name, (after, before) in numbers["not_observed"].items():

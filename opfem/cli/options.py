@@ -97,6 +97,10 @@ class FitOptions:
         Parameter(help="Take length and std as given, std by the discrepancy principle, or both as most likely."),
     ] = "given"
     nonnegative: Annotated[bool, Parameter(help="Keep the pressure above zero.")] = False
+    model_std: Annotated[
+        float,
+        Parameter(help="Standard deviation of the computed thickness in mm, what the mesh is off; see op.mesh_error."),
+    ] = 0.0
     friction_spread: Annotated[
         float | None,
         Parameter(help="Relative uncertainty of both frictions, fitted as well and allowed for. Default: none."),
