@@ -7,7 +7,7 @@ Run `python -m benchmarks.traction_fit CASE`, CASE one of
 - `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3]`: Jacobian products, with and without preconditioner;
 - `coin MAP`: the published coin, or the map simulated from its own fit;
 - `coverage [--fits 400] [--first 0]`: truths drawn from the prior on 12 × 12 × 2, one functional each;
-- `edge`: a step of pressure, its edge-spread width against mesh, noise and prior;
+- `edge [--out FILE.png]`: a step of pressure, its edge-spread width against mesh, noise and prior;
 - `parameters [--fits 100]`: window friction and C10 from three maps and readings of the force.
 
 Each prints JSON lines.
@@ -22,6 +22,7 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
@@ -254,47 +255,77 @@ def coverage_case(fits: int, first: int) -> None:
     )
 
 
-def edge_case() -> None:
-    """A step of pressure: how wide does the fit make it?"""
-    for elements, side, noise_factor, length in (
-        ((40, 8, 4), 5.0, 1.0, 0.25),
-        ((80, 8, 8), 5.0, 1.0, 0.25),
-        ((80, 8, 8), 2.0, 1.0, 0.1),
-        ((80, 8, 8), 2.0, 1.0, 0.25),
-        ((80, 8, 8), 2.0, 0.1, 0.1),
-    ):
-        print(json.dumps(edge_width(elements, side, noise_factor, length)), flush=True)
+def edge_case(out: Path | None) -> None:
+    """A step of pressure: how wide does the fit make it, by mesh, noise and prior?"""
+    rows = []
+    for elements, side in (((40, 8, 4), 5.0), ((80, 8, 8), 5.0), ((80, 8, 8), 2.0)):
+        for noise in (NOISE, 0.1 * NOISE):
+            for length in (0.25, 0.125):
+                rows.append(edge_width(elements, side, noise, length))
+                print(json.dumps(rows[-1]), flush=True)
+    if out is not None:
+        plot_edges(rows, out)
 
 
-def edge_width(elements: tuple[int, int, int], side: float, noise_factor: float, length: float) -> dict:
-    """Fit a step of 2 to 6 kPa half-way along x; the width is from 10 to 90 % of its height."""
+def edge_width(elements: tuple[int, int, int], side: float, noise: float, length: float) -> dict:
+    """Fit a step of 2 to 6 kPa half-way along x, in plane strain; its width is from 10 to 90 % of its height."""
     nx, ny, nz = elements
     strip = side * ny / nx
-    palpation = eqx.tree_at(lambda p: p.extent, experiment(elements, side), jnp.array([side, strip]))
-    fine_elements = (2 * nx, ny, nz)
-    fine = eqx.tree_at(lambda p: p.extent, experiment(fine_elements, side), jnp.array([side, strip]))
+
+    def plane_strain(elements: tuple[int, int, int]) -> op.Palpation:
+        square = experiment(elements, side)
+        return op.Palpation(
+            square.layer, (side, strip), elements, square.window, square.sample, {"y0": "roller", "y1": "roller"}
+        )
+
+    palpation, fine = plane_strain(elements), plane_strain((2 * nx, ny, nz))
     x, _ = fine.mesh().plane()
-    solution = op.solve(fine, op.Traction(jnp.where(x < 0.5 * side, 2e-3, 6e-3)))
+    solution = op.solve(fine, op.Traction(jnp.where(x < 0.5 * side, 2e-3, 6e-3)), progress=False)
     heights = interface_heights(fine.mesh(), solution.displacement[:, -1])
-    noise = noise_factor * NOISE
     values = heights + noise * np.random.default_rng(0).standard_normal(heights.shape)
     measured = op.ThicknessMap(values, extent=(side, strip), std=noise)
-    fit = op.fit_traction(palpation, measured, op.Matern(length=length, std=2e-3, mean=4e-3), draws=4, throw=False)
+    prior = op.Matern(length=length, std=2e-3, mean=4e-3)
+    fit = op.fit_traction(palpation, measured, prior, draws=4, throw=False, progress=False)
     line = 1e3 * np.asarray(jnp.mean(fit.normal, axis=0))
     place = np.linspace(0.0, side, nx + 1)
     low, high = np.mean(line[place < 0.3 * side]), np.mean(line[place > 0.7 * side])
     share = (line - low) / (high - low)
-    near = np.abs(place - 0.5 * side) < 0.3 * side
-    ends = [np.interp(level, share[near], place[near]) for level in (0.1, 0.9)]
+    # Where the profile last leaves the lower end and first reaches the upper one, between nodes.
+    middle = int(np.searchsorted(place, 0.5 * side))
+    left = middle - int(np.argmax(share[middle::-1] < 0.1))
+    right = middle + int(np.argmax(share[middle:] > 0.9))
+    ends = [np.interp(0.1, share[left : left + 2], place[left : left + 2])]
+    ends.append(np.interp(0.9, share[right - 1 : right + 1], place[right - 1 : right + 1]))
     return {
         "element_um": 1e3 * side / nx,
         "noise_um": 1e3 * noise,
+        "pixels_per_element": 2,
         "prior_length_mm": length,
         "edge_10_90_um": round(1e3 * (ends[1] - ends[0]), 1),
         "resolution_um": round(1e3 * float(np.median(fit.resolution_width)), 1),
         "message": op.FitStatus[fit.result],
         "reduced_chi2": round(float(fit.reduced_chi2), 3),
     }
+
+
+def plot_edges(rows: list[dict], out: Path) -> None:
+    """Draw the widths of a step's edge."""
+    figure, ax = plt.subplots(figsize=(6.4, 4.0), layout="compressed")
+    for (noise, length), style in zip(
+        sorted({(row["noise_um"], row["prior_length_mm"]) for row in rows}),
+        ("C0o-", "C0s--", "C1o-", "C1s--"),
+        strict=True,
+    ):
+        mine = sorted(
+            (row["element_um"], row["edge_10_90_um"])
+            for row in rows
+            if (row["noise_um"], row["prior_length_mm"]) == (noise, length)
+        )
+        ax.plot(*zip(*mine, strict=True), style, label=f"noise {noise:.1f} µm, prior length {1e3 * length:.0f} µm")
+    ax.axhspan(15.0, 25.0, color="0.85", label="published claim")
+    ax.set(xlabel="Element [µm]", ylabel="Width of a step's edge, 10 to 90 % [µm]", ylim=(0.0, None))
+    ax.legend(fontsize="small")
+    figure.savefig(out, dpi=150)
 
 
 def parameters_case(fits: int) -> None:
@@ -335,6 +366,7 @@ def main() -> None:
     parser.add_argument("--block", type=float, default=0.3)
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="picture of `edge` (.png)")
     chosen = parser.parse_args(sys.argv[1:])
     jax.config.update("jax_enable_x64", True)
     if chosen.case == "truth":
@@ -346,7 +378,7 @@ def main() -> None:
     elif chosen.case == "coverage":
         coverage_case(chosen.fits, chosen.first)
     elif chosen.case == "edge":
-        edge_case()
+        edge_case(chosen.out)
     else:
         parameters_case(chosen.fits)
 
