@@ -103,8 +103,7 @@ def fit_traction(
     maps = _as_tuple(thickness)
     _check(palpation, maps, prior, lateral, parameters)
     several = not isinstance(thickness, ThicknessMap)
-    seen = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
-    observations = seen(palpation.mesh(), *_stacked_maps(maps), jnp.asarray(model_std, float))
+    observations = _observe(palpation.mesh(), *_stacked_maps(maps), jnp.asarray(model_std, float))
     _check_covered(maps, observations)
     misfit = Misfit(
         palpation=palpation,
@@ -154,8 +153,7 @@ class _Run:
             jnp.asarray(_CG_STEPS),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
-        structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
-        state = gauss_newton.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
+        state = _begin(gauss_newton, white, misfit)
         result, aux = FitStatus.max_steps_reached, None
         for _ in range(self.max_steps):
             white, state, aux, done = _step(gauss_newton, white, misfit, state)
@@ -180,6 +178,16 @@ class _Run:
 
 def _misfit(white: Unknowns, misfit: Misfit):
     return misfit(white)
+
+
+_observe = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
+
+
+# Compiled not for speed: the state holds a traced Jacobian, which counts as the same only if it is traced once.
+@eqx.filter_jit
+def _begin(solver, white, misfit):
+    structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
+    return solver.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
 
 
 @eqx.filter_jit

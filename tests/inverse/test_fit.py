@@ -75,6 +75,16 @@ def test_fit_knows_how_well_it_did(fit, truth):
 
 
 @pytest.mark.slow
+def test_another_map_and_prior_compile_nothing_anew(fit, truth, caplog):
+    # `fit` is asked for so that its programs are there; only small ones, on data, may follow.
+    thickness = measured(1.1 * truth, palpation(), seed=1)
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        op.fit_traction(palpation(window=0.2), thickness, op.Matern(length=0.5, std=2e-3, mean=3e-3), draws=2)
+    compiled = [record.getMessage() for record in caplog.records if "XLA compilation" in record.getMessage()]
+    assert not [m for m in compiled if any(f"({name})" in m for name in ("_begin", "_step", "_solve", "attempt"))]
+
+
+@pytest.mark.slow
 def test_covariance_agrees_with_draws(fit):
     weights = jnp.zeros((13, 13)).at[3:8, 4:9].set(1.0 / 25)
     variance = float(jnp.sum(weights * fit.covariance(weights)))
