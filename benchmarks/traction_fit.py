@@ -238,7 +238,8 @@ def coverage_case(fits: int, first: int) -> None:
         weights = jax.random.normal(jax.random.key(5000 + index), shape) / np.sqrt(np.prod(shape))
         std = float(jnp.sqrt(jnp.sum(weights * fit.covariance(weights))))
         z = float(jnp.sum(weights * (truth - fit.normal))) / std
-        rows.append({"index": index, "z": z, "fitted": bool(fit.result == op.FitStatus.successful)})
+        chi2 = round(float(fit.reduced_chi2), 3)
+        rows.append({"index": index, "z": z, "fitted": bool(fit.result == op.FitStatus.successful), "chi2": chi2})
         print(json.dumps(rows[-1]), flush=True)
     z = np.array([row["z"] for row in rows])
     ranks = np.histogram(jax.scipy.stats.norm.cdf(z), bins=20, range=(0.0, 1.0))[0]
@@ -248,6 +249,7 @@ def coverage_case(fits: int, first: int) -> None:
                 "fits": len(z),
                 "inside_95": float(np.mean(np.abs(z) < 1.96)),
                 "inside_90": float(np.mean(np.abs(z) < 1.645)),
+                "reduced_chi2": float(np.median([row["chi2"] for row in rows])),
                 "rank_chi2": float(np.sum((ranks - len(z) / 20) ** 2 / (len(z) / 20))),
             }
         ),

@@ -115,22 +115,22 @@ class Solution(eqx.Module):
     load: Load
 
     @property
-    def pressure(self) -> Float[Array, "my mx"]:
+    def pressure(self) -> Float[Array, "*maps my mx"]:
         """Contact pressure on the sample [MPa], on the current area."""
         return self.sample.pressure
 
     @property
-    def traction(self) -> Float[Array, "3 my mx"]:
+    def traction(self) -> Float[Array, "*maps 3 my mx"]:
         """Force on the layer at the interface per reference area [MPa]."""
         return self.sample.traction
 
     @property
-    def slip(self) -> Float[Array, "2 my mx"]:
+    def slip(self) -> Float[Array, "*maps 2 my mx"]:
         """Slip of the interface along the sample [mm]."""
         return self.sample.slip
 
     @property
-    def contact_status(self) -> Int[Array, "my mx"]:
+    def contact_status(self) -> Int[Array, "*maps my mx"]:
         """Status of the interface: 0 open, 1 stick, 2 slip."""
         return self.sample.status
 
