@@ -193,22 +193,24 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
     experiment, settings, prior, _ = small
     thickness = small_map(small)
     fit = op.fit_traction(experiment, thickness, prior, solver=settings, draws=1)
-    weights = jax.random.normal(jax.random.key(0), (7, 7))
     change = jax.random.normal(jax.random.key(1), thickness.shape)
+
+    def variation(normal):
+        return 1e6 * jnp.sum((normal - 3e-3) ** 2)  # kPa²
 
     @jax.jit  # one program, for values too: each takes minutes to compile
     @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
     def functional(values, length, std):
         moved = eqx.tree_at(lambda m: m.values, thickness, values)
-        return 1e3 * jnp.sum(weights * op.refitted(fit, moved, op.Matern(length, std, mean=3e-3)))
+        return variation(op.refitted(fit, moved, op.Matern(length, std, mean=3e-3)))
 
     at = (thickness.values, 0.6, 1e-3)
     value, slopes = functional(*at)
-    assert value == pytest.approx(1e3 * float(jnp.sum(weights * fit.normal)), rel=2e-3)
+    assert value == pytest.approx(float(variation(fit.normal)), rel=2e-3)
     for slope, direction, h in (
-        (jnp.sum(slopes[0] * change), (change, 0.0, 0.0), 1e-5),
-        (slopes[1], (0.0, 1.0, 0.0), 1e-4),
-        (slopes[2], (0.0, 0.0, 1.0), 1e-6),
+        (jnp.sum(slopes[0] * change), (change, 0.0, 0.0), 1e-4),
+        (slopes[1], (0.0, 1.0, 0.0), 1e-3),
+        (slopes[2], (0.0, 0.0, 1.0), 1e-5),
     ):
         ahead, behind = (
             functional(*(a + s * h * d for a, d in zip(at, direction, strict=True)))[0] for s in (1.0, -1.0)
