@@ -144,7 +144,7 @@ def test_options_of_the_other_solver_are_refused(tmp_path, map_file, solved, cap
 
 @pytest.mark.slow
 def test_palpate_by_explicit_dynamics(tmp_path, map_file):
-    options = ("--solver", "explicit", "--duration", 0.05)
+    options = ("--solver", "explicit", "--duration", 0.2)
     assert opfem("palpate", map_file, *SMALL, *options, "--out", tmp_path / "a") == 0
     written = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert written["status"] == "successful"
