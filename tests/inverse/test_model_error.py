@@ -6,9 +6,6 @@ import pytest
 import opfem as op
 from opfem.inverse.observation import interface_heights
 
-# The estimate is of first order in a smaller error: halving once more leaves a sixteenth.
-OF_AN_ESTIMATE = 0.3
-
 
 def pressed(elements):
     palpation = op.Palpation(
@@ -25,12 +22,15 @@ def pressed(elements):
 
 @pytest.mark.slow
 def test_half_the_mesh_tells_what_the_mesh_misses():
-    on_mesh, on_finer = pressed((8, 8, 2)), pressed((16, 16, 4))
+    on_mesh, on_finer = pressed((16, 16, 4)), pressed((32, 32, 8))
     heights = [interface_heights(s.palpation.mesh(), s.displacement[:, -1]) for s in (on_mesh, on_finer)]
     # What is left of the finer mesh's own error is a quarter.
     missed = (heights[0] - heights[1][::2, ::2])[::2, ::2] * 4.0 / 3.0
     estimate = np.asarray(op.mesh_error(on_mesh))
-    assert np.linalg.norm(estimate - missed) < OF_AN_ESTIMATE * np.linalg.norm(missed)
+    # Elements of half the mesh are as wide as the bump's flank: size and pattern are right, not every value.
+    sizes = np.linalg.norm(estimate), np.linalg.norm(missed)
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.3)
+    assert np.sum(estimate * missed) > 0.85 * sizes[0] * sizes[1]
 
 
 def test_other_loads_are_refused(solution):
