@@ -17,6 +17,9 @@ from opfem.solvers.derivative import follow_path
 from opfem.solvers.discretise import discretise
 from opfem.solvers.stepping import attempt, begin, unfinished
 
+# A fit compiles for minutes on a busy machine.
+pytestmark = pytest.mark.timeout(1500)
+
 NOISE, SIDE, ELEMENTS = 2e-3, 1.5, (12, 12, 2)
 PRIOR = op.Matern(length=0.6, std=1.5e-3, mean=3e-3)
 
@@ -188,8 +191,7 @@ def small_map(small, seed=0, load=1.0, mask=None):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1500)
-@pytest.mark.xfail(reason="Not solved yet: by the data 0.5 % off, by the prior's length and std 0.16 %.")
+@pytest.mark.xfail(run=False, reason="Not solved yet: by the data 0.5 % off, by the prior's length and std 0.16 %.")
 def test_derivative_of_the_fitted_traction_through_the_optimum(small):
     experiment, settings, prior, _ = small
     thickness = small_map(small)
