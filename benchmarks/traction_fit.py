@@ -223,7 +223,7 @@ def coin_case(path: Path) -> None:
 
 def coverage_case(fits: int, first: int) -> None:
     """Truths drawn from the prior (VALIDATION.md test 42): is a functional in its own interval, and at what rank?"""
-    side, prior, settings = 1.5, op.Matern(length=0.6, std=1.5e-3, mean=3e-3), op.Newton(increments=2, max_path=6)
+    side, prior, settings = 1.5, op.Matern(length=0.6, std=1.5e-3, mean=3e-3), op.Newton(increments=2, max_path=12)
     palpation = experiment((12, 12, 2), side)
     shape = palpation.mesh().thickness.shape
     rows = []
@@ -332,7 +332,7 @@ def plot_edges(rows: list[dict], out: Path) -> None:
 
 def parameters_case(fits: int) -> None:
     """Window friction and C10 from three maps and force readings of 1 % (same model)."""
-    side, settings = 1.5, op.Newton(increments=2, max_path=6)
+    side, settings = 1.5, op.Newton(increments=2, max_path=12)
     palpation = experiment((8, 8, 2), side)
     prior = op.Matern(length=0.6, std=1e-3, mean=3e-3)
     pattern = prior_field(palpation, prior, seed=7)

@@ -164,7 +164,8 @@ class _Run:
                 result = FitStatus.not_carried
                 break
             if not np.isfinite(loss) or not all(bool(jnp.all(jnp.isfinite(v))) for v in jax.tree.leaves(state.y_eval)):
-                result = FitStatus.nonfinite
+                followed = bool(jnp.all(aux["followed"]))
+                result = FitStatus.nonfinite if followed else FitStatus.too_many_increments
                 break
             if bool(done):
                 result = FitStatus.successful

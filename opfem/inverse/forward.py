@@ -19,11 +19,13 @@ class Pressed(NamedTuple):
         u: Displacement of its nodes [mm].
         reached: Load fraction that the solve reached [-].
         newton: Newton steps taken.
+        followed: Whether its derivative follows all increments: they are no more than `Newton.max_path`.
     """
 
     u: Float[Array, "3 mz my mx"]
     reached: Array
     newton: Array
+    followed: Array
 
 
 def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = False) -> Pressed:
@@ -42,4 +44,4 @@ def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = Fa
     end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
     through = follow_path if exact else linearise_path
     _, state = through(problem, start.state, end.path, end.kept, settings)
-    return Pressed(state.u, end.state.fraction, end.newton)
+    return Pressed(state.u, end.state.fraction, end.newton, end.kept <= solver.max_path)

@@ -123,7 +123,7 @@ class Misfit(eqx.Module):
             std = std.reshape(std.shape + (1,) * (4 - std.ndim))
             off = (pressed.u[:, 2] - self.inside.values) / std
             residuals["inside"] = jnp.where(self.inside.mask, 0.0, off)
-        aux = {"carried": pressed.reached >= 1.0, "heights": heights, "newton": pressed.newton}
+        aux = {"carried": pressed.reached >= 1.0, "followed": pressed.followed, "heights": heights}
         return residuals, aux
 
 

@@ -134,15 +134,16 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
         return jnp.clip(place - jnp.stack([field(*at)[0] for field in frozen]), 0.0, far)
 
     at = jax.lax.fori_loop(0, _LOCATING_STEPS, closer, place)
-    # One Newton step carries the derivative; across an edge that the place lies beyond there is none.
-    values, slope_x, slope_y = (jnp.stack(part) for part in zip(*(field(*at) for field in moved), strict=True))
-    off = place - at - values
-    found = jax.lax.stop_gradient(jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None])
-    off = jnp.where(found, off, 0.0)
-    (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(found, slope, 0.0)) for slope in (slope_x, slope_y))
-    determinant = (1.0 + a) * (1.0 + d) - b * c
-    step = jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
-    return height(*(at + step))[0]
+    # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
+    for _ in range(2):
+        values, slope_x, slope_y = (jnp.stack(part) for part in zip(*(field(*at) for field in moved), strict=True))
+        off = place - at - values
+        found = jax.lax.stop_gradient(jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None])
+        off = jnp.where(found, off, 0.0)
+        (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(found, slope, 0.0)) for slope in (slope_x, slope_y))
+        determinant = (1.0 + a) * (1.0 + d) - b * c
+        at = at + jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
+    return height(*at)[0]
 
 
 def _spline_values(t: Float[Array, " points"], cells: int) -> tuple[Array, Array]:

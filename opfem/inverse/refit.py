@@ -30,8 +30,7 @@ def refitted(
     """Find the optimum again under slightly other data or another prior, differentiably.
 
     It goes on from a fit by exact gradients; derivatives come from the implicit function at the optimum, forward and
-    reverse, second derivatives of the layer's response included; against differences they are off by up to 0.5 % so
-    far. Works under `jit`, `grad` and `jvp`.
+    reverse, second derivatives of the layer's response included. Works under `jit`, `grad` and `jvp`.
 
     Args:
         fit: A fit of one map.

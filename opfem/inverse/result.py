@@ -34,6 +34,10 @@ class FitStatus(eqx.Enumeration):
         "length; where the sample does not touch, mask the map, or keep the layer from being pulled off its window by "
         "fit_traction(nonnegative=True)."
     )
+    too_many_increments = (
+        "The forward solve takes more increments than its derivative follows. Raise max_path of "
+        "fit_traction(solver=Newton(max_path=...)), or ask for fewer increments."
+    )
     nonfinite = "A derivative of the layer's response is not finite: a linear solve did not converge. Smooth the map."
 
 

@@ -191,7 +191,6 @@ def small_map(small, seed=0, load=1.0, mask=None):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(run=False, reason="Not solved yet: by the data 0.5 % off, by the prior's length and std 0.16 %.")
 def test_derivative_of_the_fitted_traction_through_the_optimum(small):
     experiment, settings, prior, _ = small
     thickness = small_map(small)
@@ -218,7 +217,7 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
         ahead, behind = (
             functional(*(a + s * h * d for a, d in zip(at, direction, strict=True)))[0] for s in (1.0, -1.0)
         )
-        assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-3)
+        assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-4)
 
 
 @pytest.mark.slow
@@ -242,6 +241,13 @@ def test_friction_and_modulus_from_three_maps_and_forces(small):
         assert np.log(high / low) < 0.6 * 2 * 2.58 * 0.5
     total = jnp.sum(fit.normal * area, axis=(1, 2))
     assert total == pytest.approx(np.array([float(r.force) for r in readings]), rel=0.02)
+
+
+@pytest.mark.slow
+def test_path_that_is_too_short_is_named(small):
+    experiment, _, prior, _ = small
+    with pytest.raises(op.FitError, match="Raise max_path"):
+        op.fit_traction(experiment, small_map(small), prior, solver=op.Newton(increments=3, max_path=2), progress=False)
 
 
 @pytest.mark.slow
