@@ -120,6 +120,10 @@ def fit_traction(
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
         reached = run.fit(_linear_start(misfit))
+        if bool(reached.result != FitStatus.successful) and prior.mean is not None:
+            # The linear estimate pulls and presses harder than the layer takes: start from what the prior expects.
+            again = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
+            reached = again if bool(again.result == FitStatus.successful) else reached
         if bool(reached.result == FitStatus.successful) and hyperparameters != "given":
             misfit, reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and bool(reached.result != FitStatus.successful):
