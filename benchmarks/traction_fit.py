@@ -269,8 +269,8 @@ def coverage_case(fits: int, first: int, believed: float) -> None:
 def edge_case(out: Path | None) -> None:
     """A step of pressure: how wide does the fit make it, by mesh, noise and prior?"""
     rows = []
-    for elements, side in (((40, 8, 4), 5.0), ((80, 8, 8), 5.0), ((80, 8, 8), 2.0)):
-        for noise in (NOISE, 0.1 * NOISE):
+    for elements, side in (((80, 4, 8), 2.0), ((80, 4, 8), 5.0), ((40, 4, 4), 5.0)):
+        for noise in (NOISE, 0.25 * NOISE):
             for length in (0.25, 0.125):
                 rows.append(edge_width(elements, side, noise, length))
                 print(json.dumps(rows[-1]), flush=True)

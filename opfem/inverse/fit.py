@@ -1,5 +1,6 @@
 """`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -93,6 +94,9 @@ def fit_traction(
         throw: Raise where the fit fails. False: return what was reached, with its status.
         progress: Show a bar on a terminal or in a notebook.
 
+    Returns:
+        The fit. Where its χ² shows that the map contradicts the model, a warning says what to look at.
+
     Raises:
         ValueError: If the sample is no `Contact`, a map's std is missing or not positive, no pixel of a map lies on
             the layer, the prior's length is below the mesh, a parameter is unknown, or numbers are float32.
@@ -128,7 +132,10 @@ def fit_traction(
             misfit, reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and bool(reached.result != FitStatus.successful):
             raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
-        return _result(misfit, reached, run, several, draws, key, bar)
+        fit = _result(misfit, reached, run, several, draws, key, bar)
+    if fit.reduced_chi2 > 1.0 and fit.advice():
+        warnings.warn(fit.advice(), stacklevel=2)
+    return fit
 
 
 class _Reached(NamedTuple):

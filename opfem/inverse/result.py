@@ -17,6 +17,10 @@ from .prior import AbstractPrior
 
 # A direction counts as not observed when the data leave it this part of its standard deviation before.
 _NOT_OBSERVED = 0.5
+# χ² per degree of freedom that model and noise explain.
+_CHI2_BOUNDS = (0.5, 2.0)
+# A number takes part in a direction from this share of the largest one on.
+_MATTERS = 0.1
 # The lowest cosine modes (rows, columns) that are looked at by name.
 _MODES = {"mean pressure": (0, 0), "pressure rising along x": (0, 1), "pressure rising along y": (1, 0)}
 
@@ -117,6 +121,21 @@ class TractionFit(eqx.Module):
         """χ² over the degrees of freedom that are left to judge it by: near 1 where model and noise are right."""
         return self.chi2 / (self.observed - self.effective_dof)
 
+    def advice(self) -> str:
+        """Say what to look at where `reduced_chi2` is far from 1; nothing where it is near."""
+        if self.reduced_chi2 > _CHI2_BOUNDS[1]:
+            return (
+                f"χ² per degree of freedom is {self.reduced_chi2:.3g} and should be near 1: the layer cannot explain "
+                "the map (material, friction, L0, mask), or its noise (std) or what the mesh misses (model_std) is "
+                "larger than given. Standard deviations are then too small."
+            )
+        if self.reduced_chi2 < _CHI2_BOUNDS[0]:
+            return (
+                f"χ² per degree of freedom is {self.reduced_chi2:.3g} and should be near 1: the noise given (std or "
+                "model_std) is too large. Standard deviations are then too large."
+            )
+        return ""
+
     @property
     def numbers(self) -> dict[str, Array]:
         """Fitted numbers of the experiment, by name."""
@@ -170,7 +189,9 @@ class TractionFit(eqx.Module):
         """Name what the maps do not tell: directions that keep over half of their standard deviation before the fit.
 
         Looked at are mean and tilt of the pressure of each map, and fitted numbers. Under a bonded, nearly
-        incompressible layer a uniform pressure hardly moves the interface: its mean then rests on the prior.
+        incompressible layer a uniform pressure hardly moves the interface: its mean then rests on the prior. Numbers
+        that are known only together, such as C10 and C01 at small strain, are named by the combination that is not
+        known: "c01 - 0.31 c10" counts white unknowns, so each in standard deviations of its prior.
 
         Returns:
             By name: standard deviation after and before the fit [MPa for pressures, - for numbers' white unknowns].
@@ -188,16 +209,24 @@ class TractionFit(eqx.Module):
                 if penalised and after > _NOT_OBSERVED * before:
                     found[label] = (float(after), float(before))
         if self.misfit.parameters:
-            spread = np.sqrt(np.diag(np.asarray(self.number_covariance())))
-            for name, after in zip(self.misfit.parameters, spread, strict=True):
-                if after > _NOT_OBSERVED:
-                    found[name] = (float(after), 1.0)
+            variances, directions = np.linalg.eigh(np.asarray(self.number_covariance()))
+            for variance, direction in zip(variances, directions.T, strict=True):
+                if (after := np.sqrt(variance)) > _NOT_OBSERVED:
+                    found[_direction_name(list(self.misfit.parameters), direction)] = (float(after), 1.0)
         return found
 
     def _like_normal(self, stacked: Float[Array, "n maps my mx"]) -> Array:
         """Add nothing to draws of several maps; of a single one take the axis of maps away."""
         normal = self.misfit.normal(self.posterior.white)
         return stacked if self.residual.ndim == 3 else stacked.reshape(stacked.shape[0], *normal.shape[1:])
+
+
+def _direction_name(names: list[str], direction: np.ndarray) -> str:
+    """Write a direction as a sum of names, the largest first and alone where no other matters."""
+    order = np.argsort(-np.abs(direction))
+    parts = direction[order] / direction[order[0]]
+    others = [(part, names[i]) for part, i in zip(parts[1:], order[1:], strict=True) if abs(part) > _MATTERS]
+    return names[order[0]] + "".join(f" {'+' if part > 0 else '-'} {abs(part):.2g} {name}" for part, name in others)
 
 
 def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):

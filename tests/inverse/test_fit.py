@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import equinox as eqx
 import jax
@@ -241,6 +242,39 @@ def test_friction_and_modulus_from_three_maps_and_forces(small):
         assert np.log(high / low) < 0.6 * 2 * 2.58 * 0.5
     total = jnp.sum(fit.normal * area, axis=(1, 2))
     assert total == pytest.approx(np.array([float(r.force) for r in readings]), rel=0.02)
+
+
+@pytest.mark.slow
+def test_two_constants_are_not_told_apart_at_small_strain(small):
+    experiment, settings, prior, known = small
+    force = 0.1 * float(jnp.sum(known * tributary_area(experiment.mesh().positions()[:, -1])))
+    fit = op.fit_traction(
+        experiment,
+        small_map(small, load=0.1),
+        op.Matern(prior.length, 1e-4, mean=3e-4),
+        parameters={"layer.material.c10": op.LogNormal(2.23e-3, 0.5), "layer.material.c01": op.LogNormal(7.03e-4, 0.5)},
+        forces=op.ForceReading(force, 0.01 * force),
+        solver=settings,
+        draws=2,
+        progress=False,
+    )
+    # Their sum is half of the shear modulus: 0.76 and 0.24 of a relative change of it.
+    (name,) = (name for name in fit.unobserved() if "c01" in name)
+    assert re.fullmatch(r"layer\.material\.c01 - 0\.[23]\d? layer\.material\.c10", name)
+    after, before = fit.unobserved()[name]
+    assert 0.9 < after <= before * 1.001
+    covariance = fit.number_covariance()
+    assert covariance[0, 1] / jnp.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.5
+
+
+@pytest.mark.slow
+def test_a_map_that_contradicts_the_model_is_told(small):
+    experiment, settings, prior, _ = small
+    careless = eqx.tree_at(lambda m: m.std, small_map(small), jnp.asarray(0.1 * NOISE))
+    with pytest.warns(UserWarning, match="cannot explain the map"):
+        fit = op.fit_traction(experiment, careless, prior, solver=settings, draws=1, progress=False)
+    assert fit.result == op.FitStatus.successful
+    assert fit.reduced_chi2 > 10
 
 
 @pytest.mark.slow
