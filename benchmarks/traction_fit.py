@@ -291,7 +291,7 @@ def edge_case(out: Path | None) -> None:
 
 
 def edge_width(elements: tuple[int, int, int], side: float, noise: float, length: float) -> dict:
-    """Fit a step of 2 to 6 kPa half-way along x, in plane strain; its width is from 10 to 90 % of its height."""
+    """Fit a step of 2 to 4 kPa half-way along x, in plane strain; its width is from 10 to 90 % of its height."""
     nx, ny, nz = elements
     strip = side * ny / nx
 
@@ -303,11 +303,11 @@ def edge_width(elements: tuple[int, int, int], side: float, noise: float, length
 
     palpation, fine = plane_strain(elements), plane_strain((2 * nx, ny, nz))
     x, _ = fine.mesh().plane()
-    solution = op.solve(fine, op.Traction(jnp.where(x < 0.5 * side, 2e-3, 6e-3)), progress=False)
+    solution = op.solve(fine, op.Traction(jnp.where(x < 0.5 * side, 2e-3, 4e-3)), progress=False)
     heights = interface_heights(fine.mesh(), solution.displacement[:, -1])
     values = heights + noise * np.random.default_rng(0).standard_normal(heights.shape)
     measured = op.ThicknessMap(values, extent=(side, strip), std=noise)
-    prior = op.Matern(length=length, std=2e-3, mean=4e-3)
+    prior = op.Matern(length=length, std=2e-3, mean=3e-3)
     fit = op.fit_traction(palpation, measured, prior, draws=4, throw=False, progress=False)
     line = 1e3 * np.asarray(jnp.mean(fit.normal, axis=0))
     place = np.linspace(0.0, side, nx + 1)

@@ -54,7 +54,9 @@ class HardOverclosure(AbstractOverclosure):
 
     Enforced by a penalty of `stiffness_ratio` times the stiffness of one element of the layer,
     so that penetration is about 1/stiffness_ratio of the element's own shortening under the
-    same pressure: about 0.05 µm at 10 kPa. `stats["max_penetration"]` reports it.
+    same pressure: about 0.05 µm at 10 kPa. `stats["max_penetration"]` reports it. That stiffness is the confined
+    modulus, with at most 20 shear moduli for the bulk modulus, over the element's height; and times (height/width)²
+    where it is wider than high: a flat layer bends, and stiffer contact would open and close without end.
 
     `exact=True` leaves none, usually below 1e-4 µm, for a tenth more work: the method of multipliers. Each
     increment carries the pressure of the last one without penetration, and at full load increments follow

@@ -41,10 +41,12 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     mesh = palpation.mesh()
     material = palpation.layer.material
     X = mesh.positions()
-    bulk = material.bulk
-    if palpation.element == "hybrid":  # the scale of contact; the bulk modulus may be infinite
-        bulk = jnp.minimum(bulk, VOLUME_GUARD * material.shear)
-    stiffness = (bulk + 4.0 / 3.0 * material.shear) * mesh.layers / jnp.mean(mesh.thickness)
+    # The scale of hard contact: an element's own stiffness, but no more than its shape gives way with. Contact much
+    # stiffer than that (nearly incompressible, or flat and lifted off in part) opens and closes without end.
+    bulk = jnp.minimum(material.bulk, VOLUME_GUARD * material.shear)
+    height = jnp.mean(mesh.thickness) / mesh.layers
+    flatness = jnp.minimum(1.0, height / mesh.element_size)
+    stiffness = flatness**2 * (bulk + 4.0 / 3.0 * material.shear) / height
 
     nx, ny, nz = mesh.elements
     cells, _ = ELEMENT_FORMS[palpation.element]

@@ -67,7 +67,7 @@ class Newton(eqx.Module):
     krylov_steps: float | int | Array = 120
     max_backtracks: float | int | Array = 6
     step_limit: float | int | Array = 0.1
-    max_increments: int = eqx.field(static=True, default=400)
+    max_increments: int = eqx.field(static=True, default=1500)
     max_path: int = eqx.field(static=True, default=64)
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
 

@@ -270,11 +270,13 @@ def test_two_constants_are_not_told_apart_at_small_strain(small):
 @pytest.mark.slow
 def test_a_map_that_contradicts_the_model_is_told(small):
     experiment, settings, prior, _ = small
-    careless = eqx.tree_at(lambda m: m.std, small_map(small), jnp.asarray(0.1 * NOISE))
+    # As short as the layer is thick: the prior allows no traction that makes such waves.
+    waves = 0.03 * jnp.cos(2.0 * jnp.pi * jnp.linspace(0.0, SIDE, 31) / 0.5)
+    wavy = eqx.tree_at(lambda m: m.values, thickness := small_map(small), thickness.values + waves)
     with pytest.warns(UserWarning, match="cannot explain the map"):
-        fit = op.fit_traction(experiment, careless, prior, solver=settings, draws=1, progress=False)
+        fit = op.fit_traction(experiment, wavy, prior, solver=settings, draws=1, progress=False)
     assert fit.result == op.FitStatus.successful
-    assert fit.reduced_chi2 > 10
+    assert fit.reduced_chi2 > 5
 
 
 @pytest.mark.slow
