@@ -171,12 +171,14 @@ class _Run:
             self.solves += 1
             loss, inner = float(state.f_info.as_min()), int(state.descent_state.iterations)
             self.bar.show(self.solves, loss, self.iterations + inner)
+            if not bool(jnp.all(aux["followed"])):
+                result = FitStatus.too_many_increments
+                break
             if not bool(jnp.all(aux["carried"])):
                 result = FitStatus.not_carried
                 break
             if not np.isfinite(loss) or not all(bool(jnp.all(jnp.isfinite(v))) for v in jax.tree.leaves(state.y_eval)):
-                followed = bool(jnp.all(aux["followed"]))
-                result = FitStatus.nonfinite if followed else FitStatus.too_many_increments
+                result = FitStatus.nonfinite
                 break
             if bool(done):
                 result = FitStatus.successful

@@ -19,7 +19,8 @@ class Pressed(NamedTuple):
         u: Displacement of its nodes [mm].
         reached: Load fraction that the solve reached [-].
         newton: Newton steps taken.
-        followed: Whether its derivative follows all increments: they are no more than `Newton.max_path`.
+        followed: Whether its derivative follows all increments. The solve ends where they are more than
+            `Newton.max_path`.
     """
 
     u: Float[Array, "3 mz my mx"]
@@ -41,7 +42,11 @@ def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = Fa
     problem = discretise(palpation, load, None, solver.face_rule)
     start = begin(problem.initial_state(), solver, True)
     frozen, settings = jax.lax.stop_gradient((problem, solver))
-    end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
+
+    def goes_on(s):
+        return unfinished(s) & (s.kept <= settings.max_path)
+
+    end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
     through = follow_path if exact else linearise_path
     _, state = through(problem, start.state, end.path, end.kept, settings)
     return Pressed(state.u, end.state.fraction, end.newton, end.kept <= solver.max_path)

@@ -39,8 +39,9 @@ class FitStatus(eqx.Enumeration):
         "fit_traction(nonnegative=True)."
     )
     too_many_increments = (
-        "The forward solve takes more increments than its derivative follows. Raise max_path of "
-        "fit_traction(solver=Newton(max_path=...)), or ask for fewer increments."
+        "The forward solve takes more increments than its derivative follows, as where the layer hardly carries the "
+        "traction. Raise max_path of fit_traction(solver=Newton(max_path=...)), or ask for fewer increments; else give "
+        "the prior a smaller std or a longer length, mask what does not touch, or pass fit_traction(nonnegative=True)."
     )
     nonfinite = "A derivative of the layer's response is not finite: a linear solve did not converge. Smooth the map."
 
