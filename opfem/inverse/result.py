@@ -31,7 +31,8 @@ class FitStatus(eqx.Enumeration):
     successful = ""
     max_steps_reached = (
         "The fit took fit_traction(max_steps=...) Gauss–Newton steps without settling. Raise it, or start closer: "
-        "a prior with a mean, a longer length or a smaller std."
+        "from the normal traction of a fit on a coarser mesh (start=...), a prior with a mean, a longer length or a "
+        "smaller std."
     )
     not_carried = (
         "The layer does not carry the traction that the fit starts from. Give the prior a smaller std or a longer "

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import opfem as op
+from opfem.inverse.fit import _on_nodes
 from opfem.inverse.forward import press
 from opfem.inverse.observation import _spline_values, interface_heights
 from opfem.mechanics.face import tributary_area
@@ -66,6 +67,24 @@ def test_fit_finds_the_traction(fit, truth):
     thickness = measured(truth, palpation())
     linear = op.linear_estimate(palpation(), thickness, PRIOR).normal
     assert error < 0.2 * jnp.linalg.norm(linear - truth) / jnp.linalg.norm(truth - truth.mean())
+
+
+@pytest.mark.slow
+def test_fit_goes_on_from_another(fit, truth):
+    again = op.fit_traction(palpation(), measured(truth, palpation()), PRIOR, start=fit.normal, draws=1, progress=False)
+    assert again.stats["forward_solves"] < fit.stats["forward_solves"]
+    assert jnp.max(jnp.abs(again.normal - fit.normal)) < 1e-2 * jnp.std(truth)
+
+
+def test_start_comes_from_any_mesh():
+    def field(nodes):
+        x = np.linspace(0.0, 1.0, nodes)
+        return np.cos(np.pi * x)[:, None] * (2.0 + np.cos(np.pi * x))
+
+    np.testing.assert_allclose(_on_nodes(field(13), 1, 13, 13)[0], field(13), atol=1e-12)
+    np.testing.assert_allclose(_on_nodes(field(7), 1, 13, 13)[0], field(13), atol=2e-3)
+    with pytest.raises(ValueError, match=r"fit_traction.start \[MPa\].*such as \(13, 13\); got shape \(2, 7, 7\)"):
+        _on_nodes(np.zeros((2, 7, 7)), 1, 13, 13)
 
 
 @pytest.mark.slow
