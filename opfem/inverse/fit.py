@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
-from scipy.ndimage import zoom
 
 from .._checks import concrete
 from .._types import ScalarLike
@@ -19,7 +18,6 @@ from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .data import AxialDisplacement, ForceReading
-from .estimates import solve_linear
 from .gauss_newton import GaussNewton, PreconditionedDescent
 from .hyperparameters import most_likely, rescaled
 from .misfit import Misfit, moved, pressure_change
@@ -31,6 +29,7 @@ from .preconditioner import Unknowns, fit_normal
 from .prior import AbstractPrior, Matern, on_nodes
 from .resolution import resolution
 from .result import FitError, FitStatus, TractionFit
+from .start import from_estimate, from_normal
 
 Choice = Literal["given", "discrepancy", "evidence"]
 # Relative gradient of each Gauss–Newton system, and most iterations.
@@ -79,8 +78,9 @@ def fit_traction(
             scaled with) and "l0_offset" [mm]. With a narrow prior: an uncertainty to allow for.
         forces: Reading of the total force under each map.
         inside: Displacements inside the layer under each map.
-        lateral: Prior of each component of the lateral traction, then fitted as well. A thickness map says little of
-            it: see `TractionFit.informed`.
+        lateral: Prior of each component of the lateral traction, then fitted as well; its mean may be the lateral
+            traction of an imprint, `(2, ny+1, nx+1)`. A thickness map says little of it: `stats["lateral_informed"]`
+            of the fit tells how much.
         nonnegative: Keep the pressure above zero.
         model_std: Standard deviation of the computed height [mm], independent from element to element: what the mesh
             misses, above all. Pixels are many, so that without it a coarse mesh is believed more than it deserves; a
@@ -128,8 +128,7 @@ def fit_traction(
     key = jax.random.key(0) if key is None else key
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
-        shape = observations.surface.shape
-        reached = run.fit(_linear_start(misfit) if start is None else misfit.white(_on_nodes(start, *shape)))
+        reached = run.fit(from_estimate(misfit) if start is None else from_normal(start, misfit))
         if bool(reached.result != FitStatus.successful) and prior.mean is not None:
             # The start pulls and presses harder than the layer takes: start from what the prior expects.
             again = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
@@ -224,31 +223,6 @@ def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):
     return white, normal, moved(residuals), jnp.sum(residuals["maps"] ** 2), iterations
 
 
-@eqx.filter_jit
-def _linear_start(misfit: Misfit) -> Unknowns:
-    """Start where small-strain elasticity of a flat layer ends."""
-    spacing, prior = misfit.palpation.mesh().spacing, misfit.prior
-
-    def one(observation):
-        white = solve_linear(misfit.palpation, observation, prior).x
-        return on_nodes(prior, white.shape) + prior.expand(white, spacing)
-
-    return misfit.white(jax.vmap(one)(misfit.observations))
-
-
-def _on_nodes(start: ArrayLike, maps: int, my: int, mx: int) -> Float[Array, "maps my mx"]:
-    """Bring a normal traction to a mesh's own nodes, by cubic splines."""
-    each = np.asarray(start, float)
-    each = each[None] if each.ndim == 2 else each
-    if each.ndim != 3 or each.shape[0] != maps or min(each.shape[1:]) < 4 or not np.all(np.isfinite(each)):
-        raise ValueError(
-            f"fit_traction.start [MPa] must be finite, one array of at least 4 × 4 interface nodes for each of {maps} "
-            f"maps, such as {(my, mx)}; got shape {np.shape(start)}."
-        )
-    factors = my / each.shape[1], mx / each.shape[2]
-    return jnp.stack([zoom(one, factors, order=3, mode="mirror") for one in each])
-
-
 def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyArray) -> tuple[Misfit, _Reached]:
     """Fit again under other hyper-parameters, each fit from the last, until they settle."""
     low, high = -np.inf, np.inf  # logarithms of factors on the standard deviation that are too small, too large
@@ -325,9 +299,17 @@ def _result(
             "std_error": 1.0 / (2.0 * draws) ** 0.5,
             "representation_rms": jnp.sqrt(jnp.mean(misfit.observations.representation_rms**2)),
             "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
+            **_informed(misfit, whites),
         },
         result=reached.result,
     )
+
+
+def _informed(misfit: Misfit, whites: list[Unknowns]) -> dict[str, Array]:
+    """Tell how much of the variance of a fitted lateral traction the maps took away."""
+    if misfit.lateral is None:
+        return {}
+    return {"lateral_informed": 1.0 - jnp.mean(jnp.stack([white.lateral for white in whites]) ** 2)}
 
 
 def _pressure_deviations(

@@ -89,7 +89,8 @@ class Misfit(eqx.Module):
         if self.lateral is None or white.lateral is None:
             return jax.vmap(Traction)(self.normal(white))
         spacing, prior = self.palpation.mesh().spacing, self.lateral
-        lateral = jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
+        mean = on_nodes(prior, white.lateral.shape[1:])
+        lateral = mean + jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
         return jax.vmap(Traction)(self.normal(white), lateral)
 
     def __call__(self, white: Unknowns, exact: bool = False) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -78,7 +78,7 @@ class Matern(AbstractPrior):
         length: Correlation length [mm].
         std: Standard deviation [MPa].
         smoothness: 1.5 by default: once differentiable. Infinity: exp(-d²/(2 length²)).
-        mean: A number, or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
+        mean: A number, or interface nodes `(ny+1, nx+1)` [MPa], of a lateral traction `(2, ny+1, nx+1)`; None: zero.
 
     Raises:
         ValueError: For a number that is not positive.
@@ -216,17 +216,17 @@ class TotalVariation(AbstractPrior):
         return factor * slopes, _HARDLY * white[0, 0]
 
 
-def on_nodes(prior: AbstractPrior, shape: tuple[int, int]) -> Nodes:
-    """Spread the prior's mean over the interface's nodes [MPa].
+def on_nodes(prior: AbstractPrior, shape: tuple[int, ...]) -> Array:
+    """Spread the prior's mean over the interface's nodes [MPa], of both components where it is of a lateral traction.
 
     Raises:
         ValueError: If it is a map of another shape.
     """
     mean = jnp.zeros(()) if prior.mean is None else prior.mean
     if mean.ndim and mean.shape != shape:
+        nodes = "(ny+1, nx+1)" if len(shape) == 2 else "(2, ny+1, nx+1)"
         raise ValueError(
-            f"{type(prior).__name__}.mean [MPa] must be a number or interface nodes (ny+1, nx+1) = {shape}, "
-            f"got {mean.shape}."
+            f"{type(prior).__name__}.mean [MPa] must be a number or interface nodes {nodes} = {shape}, got {mean.shape}."
         )
     return jnp.broadcast_to(mean, shape)
 

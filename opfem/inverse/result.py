@@ -73,7 +73,8 @@ class TractionFit(eqx.Module):
         stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (each one product with the Jacobian and one
             with its transpose), `posterior_iterations`, `draws`, `std_error` (relative standard error of the standard
             deviations [-]), `representation_rms` [mm] (what the map has beyond mesh-spaced splines),
-            `misfit_rms` [mm].
+            `misfit_rms` [mm]; `lateral_informed` [-] where the lateral traction was fitted: 0 where it rests on its
+            prior alone, 1 where on the maps.
         result: How the fit ended.
     """
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.fit import _on_nodes
 from opfem.inverse.forward import press
 from opfem.inverse.observation import _spline_values, interface_heights
+from opfem.inverse.start import on_mesh
 from opfem.mechanics.face import tributary_area
 from opfem.solvers.derivative import follow_path
 from opfem.solvers.discretise import discretise
@@ -81,10 +81,10 @@ def test_start_comes_from_any_mesh():
         x = np.linspace(0.0, 1.0, nodes)
         return np.cos(np.pi * x)[:, None] * (2.0 + np.cos(np.pi * x))
 
-    np.testing.assert_allclose(_on_nodes(field(13), 1, 13, 13)[0], field(13), atol=1e-12)
-    np.testing.assert_allclose(_on_nodes(field(7), 1, 13, 13)[0], field(13), atol=2e-3)
+    np.testing.assert_allclose(on_mesh(field(13), 1, 13, 13)[0], field(13), atol=1e-12)
+    np.testing.assert_allclose(on_mesh(field(7), 1, 13, 13)[0], field(13), atol=2e-3)
     with pytest.raises(ValueError, match=r"fit_traction.start \[MPa\].*such as \(13, 13\); got shape \(2, 7, 7\)"):
-        _on_nodes(np.zeros((2, 7, 7)), 1, 13, 13)
+        on_mesh(np.zeros((2, 7, 7)), 1, 13, 13)
 
 
 @pytest.mark.slow
@@ -238,6 +238,21 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
             functional(*(a + s * h * d for a, d in zip(at, direction, strict=True)))[0] for s in (1.0, -1.0)
         )
         assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-4)
+
+
+@pytest.mark.slow
+def test_lateral_traction_rests_on_its_prior(small):
+    experiment, settings, prior, known = small
+    rubbed = op.solve(experiment, op.Traction(known), settings).traction[:2]
+    lateral = op.Matern(0.6, 2e-4, mean=rubbed)
+    fit = op.fit_traction(
+        experiment, small_map(small), prior, lateral=lateral, solver=settings, draws=4, progress=False
+    )
+    assert jnp.linalg.norm(fit.normal - known) < 0.2 * jnp.linalg.norm(known - known.mean())
+    assert fit.stats["lateral_informed"] < 0.3
+    assert jnp.sqrt(jnp.mean((fit.traction[:2] - rubbed) ** 2)) < 2e-4
+    with pytest.raises(ValueError, match=r"Matern.mean \[MPa\].*\(2, ny\+1, nx\+1\) = \(2, 7, 7\), got \(7, 7\)"):
+        op.fit_traction(experiment, small_map(small), prior, lateral=op.Matern(0.6, 2e-4, mean=known), solver=settings)
 
 
 @pytest.mark.slow
