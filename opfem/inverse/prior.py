@@ -224,9 +224,9 @@ def on_nodes(prior: AbstractPrior, shape: tuple[int, ...]) -> Array:
     """
     mean = jnp.zeros(()) if prior.mean is None else prior.mean
     if mean.ndim and mean.shape != shape:
-        nodes = "(ny+1, nx+1)" if len(shape) == 2 else "(2, ny+1, nx+1)"
+        axes = "(ny+1, nx+1)" if len(shape) == 2 else "(2, ny+1, nx+1)"
         raise ValueError(
-            f"{type(prior).__name__}.mean [MPa] must be a number or interface nodes {nodes} = {shape}, got {mean.shape}."
+            f"{type(prior).__name__}.mean [MPa] must be a number or interface nodes {axes} = {shape}, got {mean.shape}."
         )
     return jnp.broadcast_to(mean, shape)
 
