@@ -35,6 +35,8 @@ Choice = Literal["given", "discrepancy", "evidence"]
 # Relative gradient of each Gauss–Newton system, and most iterations.
 _CG_RTOL = 1e-2
 _CG_STEPS = 60
+# The same with lateral tractions: where the window slips, little holds the layer, and no preconditioner knows it.
+_CG_STEPS_LATERAL = 300
 # A non-negative pressure bends towards zero below this part of the shear modulus.
 _SOFTNESS = 0.05
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
@@ -166,7 +168,7 @@ class _Run:
         descent = PreconditionedDescent(
             fit_normal(misfit.palpation, misfit.observations, misfit.prior),
             jnp.asarray(_CG_RTOL),
-            jnp.asarray(_CG_STEPS),
+            jnp.asarray(_CG_STEPS if misfit.lateral is None else _CG_STEPS_LATERAL),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
         state = _begin(gauss_newton, white, misfit)
