@@ -209,13 +209,12 @@ def coin_case(path: Path, n: int, model_std: float) -> None:
     palpation = experiment((n, n, n // 10), 5.0)
     prior = op.Matern(length=0.5, std=4e-3, mean=op.uniaxial_estimate(palpation, loaded).mean())
     imprint = op.solve(palpation, op.Imprint(loaded.smoothed(fwhm=0.06)))
-    place, pixels = np.linspace(0.0, 5.0, n + 1), np.linspace(0.0, 5.0, 161)
-    missed = model_std * np.random.default_rng(5).standard_normal((n + 1, n + 1))
+    # White noise of as much power as one error per element.
+    missed = model_std * 160 / n * np.random.default_rng(5).standard_normal((161, 161))
     for how in ("measured", "simulated"):
         measured = loaded
         if how == "simulated":
-            heights = surface(palpation, fit.solution, 161) + RectBivariateSpline(place, place, missed)(pixels, pixels)
-            measured = as_map(heights, 5.0, seed=4)
+            measured = as_map(surface(palpation, fit.solution, 161) + missed, 5.0, seed=4)
         begin = time.perf_counter()
         fit = op.fit_traction(palpation, measured, prior, model_std=model_std, draws=8, throw=False)
         off = fit.pressure - imprint.pressure

@@ -140,7 +140,7 @@ def fit_traction(
         if throw and bool(reached.result != FitStatus.successful):
             raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
         fit = _result(misfit, reached, run, several, draws, key, bar)
-    if fit.reduced_chi2 > 1.0 and fit.advice():
+    if bool(fit.result == FitStatus.successful) and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
     return fit
 

@@ -37,7 +37,8 @@ def resolution(posterior: Posterior, misfit: Misfit) -> tuple[Float[np.ndarray, 
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
             near = image[:, max(row - reach_y, 0) : row + reach_y + 1, max(column - reach_x, 0) : column + reach_x + 1]
-            squares = np.sum(near**2, axis=(1, 2)) / image[:, row, column] ** 2 * hx * hy
+            with np.errstate(divide="ignore", invalid="ignore"):  # of a fit that failed
+                squares = np.sum(near**2, axis=(1, 2)) / image[:, row, column] ** 2 * hx * hy
             widths[:, i, j] = _FWHM * np.sqrt(squares / np.pi)
     y, x = np.meshgrid(rows * hy, columns * hx, indexing="ij")
     return np.stack([x, y], axis=-1).reshape(-1, 2), widths.reshape(len(image), -1)

@@ -333,7 +333,9 @@ def test_missing_pixels_and_a_sample_that_does_not_touch(small):
     free = op.ThicknessMap(np.full((31, 31), 0.52), extent=(SIDE, SIDE), std=NOISE)
     with pytest.raises(op.FitError, match="nonnegative=True"):
         op.fit_traction(experiment, free, op.Matern(0.6, 1e-3), solver=settings, draws=1, progress=False)
-    kept = op.fit_traction(
-        experiment, free, op.Matern(0.6, 1e-3), nonnegative=True, solver=settings, draws=1, throw=False, progress=False
-    )
-    assert bool(kept.result != op.FitStatus.successful) or (kept.normal.min() >= 0 and kept.reduced_chi2 > 10)
+    with pytest.warns(UserWarning, match="cannot explain the map"):
+        kept = op.fit_traction(
+            experiment, free, op.Matern(0.6, 1e-3), nonnegative=True, solver=settings, draws=1, progress=False
+        )
+    assert kept.normal.min() >= 0
+    assert kept.reduced_chi2 > 10
