@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..model.deformation import inverse_cube_root
 from ..model.material import AbstractInvariantMaterial
 from .hex8 import _GAUSS, pad_axis
 from .internal import LayerBody
@@ -157,7 +158,7 @@ def _piola(material: AbstractInvariantMaterial, H: Gradient, change: Array, mean
     i1 = c[0][0] + c[1][1] + c[2][2]
     i2 = 2.0 * i1 + sum(c[m][m] * c[n][n] - c[m][n] ** 2 for m, n in ((0, 1), (1, 2), (0, 2)))
     J = 1.0 + change
-    j = _inverse_cube_root(J) ** 2
+    j = inverse_cube_root(J) ** 2
     by_I1, by_I2 = material.slopes(3.0 * (j - 1.0) + j * i1)
     a, b = 2.0 * by_I1 * j, 2.0 * by_I2 * j * j
     pull = -(a * i1 + 2.0 * b * i2) / 3.0
@@ -199,16 +200,6 @@ def _cauchy_green_change(H: Gradient) -> Gradient:
         (m, n): H[m][n] + H[n][m] + sum(H[k][m] * H[k][n] for k in range(3)) for m in range(3) for n in range(m, 3)
     }
     return [[upper[min(m, n), max(m, n)] for n in range(3)] for m in range(3)]
-
-
-def _inverse_cube_root(J: Array) -> Array:
-    """Compute J^(-1/3); XLA's float64 log and exp are scalar on CPU, so they start in float32."""
-    if J.dtype != jnp.float64:
-        return jnp.exp(jnp.log(J) * (-1.0 / 3.0))
-    y = jnp.exp(jnp.log(jax.lax.stop_gradient(J).astype(jnp.float32)) * (-1.0 / 3.0)).astype(J.dtype)
-    for _ in range(2):
-        y = y * (4.0 - J * y**3) / 3.0
-    return y
 
 
 def _by_axes(values: Float[Array, "8 _ ny nx"]) -> Float[Array, "2 2 2 _ ny nx"]:

@@ -6,10 +6,12 @@ Fields carry leading (3, 3) axes and any trailing shape, so one law serves every
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Tensor = Float[Array, "3 3 *points"]
+Entries = list[list[Float[Array, "*points"]]]
 
 
 class Kinematics(eqx.Module):
@@ -40,17 +42,15 @@ class Kinematics(eqx.Module):
 def kinematics(H: Tensor) -> Kinematics:
     """Compute what a law needs from the displacement gradient H [-]."""
     F = H + identity_like(H)
-    cof = cofactor(F)
-    trace = H[0, 0] + H[1, 1] + H[2, 2]
-    minors = cofactor(H)
-    determinant = sum(H[0, k] * minors[0, k] for k in range(3))
+    h = unstacked(H)
+    minors = _minors(h)
+    determinant = sum(h[0][k] * minors[0][k] for k in range(3))
     # J - 1 from H: near-incompressible stress is bulk times this small number.
-    change = trace + minors[0, 0] + minors[1, 1] + minors[2, 2] + determinant
+    change = _trace(h) + _trace(minors) + determinant
     C = product(transpose(F), F)
-    I1 = C[0, 0] + C[1, 1] + C[2, 2]
-    C_minors = cofactor(C)
-    I2 = C_minors[0, 0] + C_minors[1, 1] + C_minors[2, 2]
-    return Kinematics(F=F, C=C, G=cof / (1.0 + change), volume_change=change, I1=I1, I2=I2)
+    c = unstacked(C)
+    I1, I2 = _trace(c), _trace(_minors(c))
+    return Kinematics(F=F, C=C, G=cofactor(F) / (1.0 + change), volume_change=change, I1=I1, I2=I2)
 
 
 class ProductSum(eqx.Module):
@@ -126,19 +126,47 @@ def transpose(A: Tensor) -> Tensor:
     return jnp.swapaxes(A, 0, 1)
 
 
+def unstacked(A: Tensor) -> Entries:
+    """Take a tensor apart, once: reverse mode puts the entries together again in one go.
+
+    Of A[i, j] written often, each would be a whole tensor of zeros to add.
+    """
+    parts = jax.lax.split(A.reshape(9, *A.shape[2:]), [1] * 9)
+    return [[part[0] for part in parts[3 * i : 3 * i + 3]] for i in range(3)]
+
+
 def product(A: Tensor, B: Tensor) -> Tensor:
     """Multiply two fields of 3×3 matrices, point by point."""
-    return A[:, 0, None] * B[None, 0] + A[:, 1, None] * B[None, 1] + A[:, 2, None] * B[None, 2]
+    a, b = unstacked(A), unstacked(B)
+    return _stacked([[sum(a[i][m] * b[m][k] for m in range(3)) for k in range(3)] for i in range(3)])
 
 
 def cofactor(A: Tensor) -> Tensor:
     """Compute the cofactor matrix, det(A) A^(-T)."""
-    rows = [
-        [
-            A[(i + 1) % 3, (j + 1) % 3] * A[(i + 2) % 3, (j + 2) % 3]
-            - A[(i + 1) % 3, (j + 2) % 3] * A[(i + 2) % 3, (j + 1) % 3]
-            for j in range(3)
-        ]
-        for i in range(3)
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    return _stacked(_minors(unstacked(A)))
+
+
+def inverse_cube_root(J: Array) -> Array:
+    """Compute J^(-1/3); XLA's float64 log and exp are scalar on CPU, so they start in float32."""
+    if J.dtype != jnp.float64:
+        return jnp.exp(jnp.log(J) * (-1.0 / 3.0))
+    y = jnp.exp(jnp.log(jax.lax.stop_gradient(J).astype(jnp.float32)) * (-1.0 / 3.0)).astype(J.dtype)
+    for _ in range(2):
+        y = y * (4.0 - J * y**3) / 3.0
+    return y
+
+
+def _minors(a: Entries) -> Entries:
+    def minor(i: int, j: int) -> Array:
+        m, n, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+        return a[m][p] * a[n][q] - a[m][q] * a[n][p]
+
+    return [[minor(i, j) for j in range(3)] for i in range(3)]
+
+
+def _trace(a: Entries) -> Array:
+    return a[0][0] + a[1][1] + a[2][2]
+
+
+def _stacked(a: Entries) -> Tensor:
+    return jnp.stack([jnp.stack(row) for row in a])

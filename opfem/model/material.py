@@ -9,7 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_finite, check_modulus, check_positive
-from .deformation import Kinematics, ProductSum, Tensor, identity_like, kinematics, product, transpose
+from .deformation import (
+    Kinematics,
+    ProductSum,
+    Tensor,
+    identity_like,
+    inverse_cube_root,
+    kinematics,
+    product,
+    transpose,
+)
 
 
 class AbstractMaterial(eqx.Module):
@@ -107,7 +116,7 @@ class AbstractInvariantMaterial(AbstractMaterial):
             crossed=((-2.0 * b, F, F), (pull, G, G)),
             legs=((one, 2.0 * (a + b * k.I1) * eye - 2.0 * b * B, eye), (-2.0 * b, eye, C)),
         )
-        j = k.J ** (-2.0 / 3.0)
+        j = inverse_cube_root(k.J) ** 2
         curvature = self.curvature(j * k.I1 - 3.0)
         if curvature is None:
             return tangent
@@ -115,7 +124,7 @@ class AbstractInvariantMaterial(AbstractMaterial):
         return tangent + ProductSum(direct=((curvature, slope, slope),))
 
     def _terms(self, k: Kinematics) -> tuple[Array, Array, Tensor, Array]:
-        j = k.J ** (-2.0 / 3.0)
+        j = inverse_cube_root(k.J) ** 2
         by_I1, by_I2 = self.slopes(j * k.I1 - 3.0)
         a, b = by_I1 * j, by_I2 * j * j
         D = k.I1 * k.F - product(k.F, k.C)
