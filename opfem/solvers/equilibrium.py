@@ -116,12 +116,16 @@ class Problem(eqx.Module):
 
     def forces(self, x: Unknowns, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
+        return self.with_contact(self.own_forces(x, state), x.u, fraction, state)
+
+    def own_forces(self, x: Unknowns, state: State) -> Forces:
+        """Compute the forces of layer, medium and spring [N], none applied."""
         u, mean_stress = x
         internal, smallest_J = self.body.internal_force(u, mean_stress)
         volume = None if mean_stress is None else self.body.volume_residual(u, mean_stress)
         internal = internal + self._drag(self.viscosity) * _node_share(u.shape[1:]) * (u - state.u)
         spring = None if self.spring is None else -self.spring * u[:2, 0]
-        return self.with_contact(Forces(internal, volume, Bodies(), spring, smallest_J), u, fraction, state)
+        return Forces(internal, volume, Bodies(), spring, smallest_J)
 
     def with_contact(
         self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Bodies | None = None
@@ -178,16 +182,9 @@ class Problem(eqx.Module):
 
     def reactions(self, forces: Forces) -> Forces:
         """Add the reactions of prescribed displacements to the forces of window and sample."""
-        prescribed = {
-            "contact": (0, 0, 0),
-            "traction": (0, 0, 0),
-            "roller": (0, 0, 1),
-            "uz": (0, 0, 1),
-            "bonded": (1, 1, 1),
-        }
-        top, bottom = (
-            np.array(prescribed[kind])[:, None, None] for kind in (self.supports.interface, self.supports.window)
-        )
+        prescribed = {"roller": (0, 0, 1), "uz": (0, 0, 1), "bonded": (1, 1, 1)}
+        kinds = self.supports.interface, self.supports.window
+        top, bottom = (np.array(prescribed.get(kind, (0, 0, 0)))[:, None, None] for kind in kinds)
         if not (top.any() or bottom.any()):  # reverse mode need not go through the internal force
             return forces
         unbalanced = self.unbalanced(forces)
@@ -210,15 +207,16 @@ class Problem(eqx.Module):
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
         return Unknowns(self.project(jnp.asarray(self.free) * self.unbalanced(forces), held), forces.volume)
 
-    def balance(self, x: Unknowns, fraction: Array, state: State, held: Array) -> Unknowns:
+    def balance(self, x: Unknowns, fraction: Array, state: State, held: Array, own: Forces | None = None) -> Unknowns:
         """Compute the equations that a converged displacement fulfils, as many as unknowns [N].
 
         The residual of the free unknowns; a spring to the prescribed value for the others, and to the
-        last state for the rigid motion that is held.
+        last state for the rigid motion that is held. `own` are the layer's own forces where they are known.
         """
         u = x.u
         free = jnp.asarray(self.free)
-        residual = self.residual(self.forces(x, fraction, state), held)
+        forces = self.with_contact(own or self.own_forces(x, state), u, fraction, state)
+        residual = self.residual(forces, held)
         misplaced = free * (u - state.u) + (1.0 - free) * (u - self.with_imposed(u, fraction))
         placing = self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
         return residual._replace(u=residual.u + placing)
