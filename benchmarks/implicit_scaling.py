@@ -7,7 +7,8 @@ compilation and, with `--again`, those of a second solve, without; peak memory; 
 preconditioner) per Newton step, for linear systems solved to `--krylov-rtol`; and seconds over those of the mesh
 before.
 
-`--part 0.25` presses only to that part of the map's depth; `--smooth 0.3` smooths the coin over that width [mm].
+`--part 0.25` presses only to that part of the map's depth; `--smooth 0.3` smooths the coin over that width [mm];
+`--sides roller` takes the field for a part of a larger layer, which goes on beyond it alike.
 """
 
 import argparse
@@ -63,6 +64,7 @@ def statement(chosen: argparse.Namespace, n: int) -> tuple[op.Palpation, op.Impr
         window=op.Contact(op.HardOverclosure(), window),
         sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), sample),
         element=chosen.element,
+        sides=chosen.sides,
     )
     pressed = thickness - chosen.part * (thickness - np.asarray(loaded.values))
     return palpation, op.Imprint(op.ThicknessMap(pressed, extent=(side, side)))
@@ -85,6 +87,7 @@ def measure(chosen: argparse.Namespace, n: int) -> dict:
         "problem": chosen.problem,
         "elements": palpation.elements,
         "element": palpation.element,
+        "sides": chosen.sides,
         "unknowns": 3 * int(np.prod([k + 1 for k in palpation.elements])),
         "friction": chosen.friction,
         "K_over_mu": round(chosen.bulk / (2.0 * (C10 + C01))),
@@ -108,6 +111,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("map", type=Path, nargs="?", help="the coin's map")
     parser.add_argument("--elements", type=int, nargs="+", default=[40, 80], metavar="N")
     parser.add_argument("--element", default="mean_dilatation")
+    parser.add_argument("--sides", choices=("free", "roller"), default="free")
     parser.add_argument("--friction", type=float, nargs=2, default=(0.15, 0.05), metavar=("WINDOW", "SAMPLE"))
     parser.add_argument("--bulk", type=float, default=0.11732, help="MPa; 0.11732 is K/µ = 20")
     parser.add_argument("--smooth", type=float, default=0.06, help="width of smoothing [mm]")
