@@ -20,7 +20,7 @@ class Pressed(NamedTuple):
         reached: Load fraction that the solve reached [-].
         newton: Newton steps taken.
         followed: Whether its derivative follows all increments. The solve ends where they are more than
-            `Newton.max_path`.
+            `Newton.max_path`, those on the way through a snap included: a snap that long counts as not carried.
     """
 
     u: Float[Array, "3 mz my mx"]
@@ -44,7 +44,7 @@ def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = Fa
     frozen, settings = jax.lax.stop_gradient((problem, solver))
 
     def goes_on(s):
-        return unfinished(s) & (s.kept <= settings.max_path)
+        return unfinished(s) & (s.length <= settings.max_path)
 
     end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
     through = follow_path if exact else linearise_path
