@@ -48,7 +48,7 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
                 def solved(A, c):
                     tangent = slowed.tangent(solve.x, solve.fraction, state, Bodies(), transposed)
                     if transposed:
-                        A = transposed_product(slowed, solve.x, solve.fraction, state, solve.held)
+                        A = _transposed_product(slowed, solve.x, solve.fraction, state, solve.held)
                     return _solve(slowed, tangent, transposed, solve.held, A, c, is_known, settings)
 
                 return solved
@@ -160,7 +160,7 @@ def _solve(
     return jax.tree.map(lambda v: jnp.where((size(r) <= target) & is_known, v, jnp.nan), x)
 
 
-def transposed_product(problem: Problem, x: Unknowns, fraction: Array, state: State, held: Array):
+def _transposed_product(problem: Problem, x: Unknowns, fraction: Array, state: State, held: Array):
     """Make the product with the transposed derivative of the balance.
 
     The layer's own force derives from an energy. Its derivative is symmetric, and a product in forward mode takes
