@@ -90,7 +90,7 @@ def measure(chosen: argparse.Namespace, n: int) -> dict:
         "sides": chosen.sides,
         "unknowns": 3 * int(np.prod([k + 1 for k in palpation.elements])),
         "friction": chosen.friction,
-        "K_over_mu": round(chosen.bulk / (2.0 * (C10 + C01))),
+        "K_over_mu": round(chosen.bulk / (2.0 * (C10 + C01)), 1),
         "part": chosen.part,
         "message": op.RESULTS[solution.result],
         "load_fraction": float(solution.last_converged.load_fraction),

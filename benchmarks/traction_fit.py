@@ -4,8 +4,9 @@ Run `python -m benchmarks.traction_fit CASE`, CASE one of
 
 - `truth`: data from quadratic tetrahedra on a mesh 1.8 times finer, not nested, friction on both sides, 2 µm noise;
   the fit beside the imprint route, the linear and the uniaxial estimate;
-- `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3]`: Jacobian products, with and without preconditioner, and
-  the whole fit in forward solves; 0 leaves a mask out;
+- `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3] [--once]`: Jacobian products, with and without
+  preconditioner, and the whole fit in forward solves; 0 leaves a mask out; each fit twice, the second time nothing is
+  compiled, or once;
 - `coin MAP [--elements 40] [--model-std 3.2]`: the published coin, and a map simulated from its own fit;
 - `coverage [--fits 400] [--first 0] [--believed 1]`: truths drawn from the prior on 12 × 12 × 2, one functional each;
   `--believed 2.5` takes a wrong bulk modulus, so that it must fail;
@@ -142,7 +143,7 @@ def prior_field(experiment: op.Palpation, prior: op.Matern, seed: int) -> jnp.nd
     return prior.mean + prior.expand(jax.random.normal(jax.random.key(seed), mesh.thickness.shape), mesh.spacing)
 
 
-def cost_case(elements: list[int], missing: float, block: float) -> None:
+def cost_case(elements: list[int], missing: float, block: float, times: int) -> None:
     """Count products with the Jacobian, on maps of the fit's own model."""
     for n in elements:
         palpation = experiment((n, n, max(2, n // 10)), n * ELEMENT)
@@ -162,7 +163,7 @@ def cost_case(elements: list[int], missing: float, block: float) -> None:
         for name, mask in masks.items():
             measured = as_map(heights, n * ELEMENT, seed=3, mask=mask)
             seconds = []
-            for _ in range(2):
+            for _ in range(times):
                 begin = time.perf_counter()
                 fit = op.fit_traction(palpation, measured, prior, draws=2)
                 seconds.append(round(time.perf_counter() - begin, 1))
@@ -392,6 +393,7 @@ def main() -> None:
     parser.add_argument("--elements", type=int, nargs="+", default=[20, 40])
     parser.add_argument("--missing", type=float, default=0.3)
     parser.add_argument("--block", type=float, default=0.3)
+    parser.add_argument("--once", action="store_true")
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument(
@@ -409,7 +411,7 @@ def main() -> None:
     if chosen.case == "truth":
         truth_case()
     elif chosen.case == "cost":
-        cost_case(chosen.elements, chosen.missing, chosen.block)
+        cost_case(chosen.elements, chosen.missing, chosen.block, 1 if chosen.once else 2)
     elif chosen.case == "coin":
         for n in chosen.elements:
             coin_case(chosen.map, n, 1e-3 * chosen.model_std)

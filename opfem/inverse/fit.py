@@ -17,10 +17,11 @@ from ..model import Contact, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
+from .bed import lay_bed, no_bed
 from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, PreconditionedDescent
 from .hyperparameters import most_likely, rescaled
-from .misfit import Misfit, moved, pressure_change
+from .misfit import Misfit, carried, moved, pressure_change
 from .noise import noise_std
 from .observation import observe
 from .parameters import AbstractNumberPrior, check_parameters
@@ -58,7 +59,7 @@ def fit_traction(
     hyperparameters: Choice = "given",
     start: ArrayLike | None = None,
     solver: Newton = Newton(max_path=12),
-    rtol: float = 1e-3,
+    rtol: float = 3e-3,
     max_steps: int = 30,
     draws: int = 16,
     key: PRNGKeyArray | None = None,
@@ -94,7 +95,8 @@ def fit_traction(
             such as the `normal` of a fit that takes minutes less; of each map where there are several. None: the
             linear estimate.
         solver: Settings of the forward solve; `max_path` bounds its increments.
-        rtol: The fit has settled where a step changes unknowns and residuals by less [-].
+        rtol: The fit has settled where the next step would change the residuals by less, over their norm [-]: about
+            what is left to go over the posterior's standard deviations.
         max_steps: Most evaluations of the forward solve.
         draws: Draws of the posterior that standard deviations come from.
         key: Random key of the draws; None: always the same.
@@ -125,21 +127,27 @@ def fit_traction(
         forces=_stacked("forces", forces, len(maps)),
         inside=_stacked("inside", inside, len(maps)),
         softness=_SOFTNESS * palpation.layer.material.shear if nonnegative else None,
+        bed=no_bed(palpation, observations, prior),
         solver=solver.as_leaves(),
     )
     key = jax.random.key(0) if key is None else key
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
         reached = run.fit(from_estimate(misfit) if start is None else from_normal(start, misfit))
-        if bool(reached.result != FitStatus.successful) and prior.mean is not None:
+        bed = lay_bed(misfit.bed, palpation, observations, solver) if _failed(reached) and not nonnegative else None
+        if bed is not None:
+            # The layer snaps on its way under a dead load: hold it, and start from the imprint.
+            run.misfit = eqx.tree_at(lambda m: m.bed, misfit, bed)
+            reached = run.fit(misfit.white(bed.normal))
+        elif _failed(reached) and prior.mean is not None:
             # The start pulls and presses harder than the layer takes: start from what the prior expects.
             again = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
-            reached = again if bool(again.result == FitStatus.successful) else reached
-        if bool(reached.result == FitStatus.successful) and hyperparameters != "given":
-            misfit, reached = _choose(run, reached, hyperparameters, draws, key)
-        if throw and bool(reached.result != FitStatus.successful):
+            reached = reached if _failed(again) else again
+        if not _failed(reached) and hyperparameters != "given":
+            reached = _choose(run, reached, hyperparameters, draws, key)
+        if throw and _failed(reached):
             raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
-        fit = _result(misfit, reached, run, several, draws, key, bar)
+        fit = _result(reached, run, several, draws, key, bar)
     if bool(fit.result == FitStatus.successful) and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
     return fit
@@ -153,6 +161,10 @@ class _Reached(NamedTuple):
     aux: dict[str, Array]
     posterior: Posterior
     result: FitStatus
+
+
+def _failed(reached: _Reached) -> bool:
+    return bool(reached.result != FitStatus.successful)
 
 
 class _Run:
@@ -169,6 +181,7 @@ class _Run:
             fit_normal(misfit.palpation, misfit.observations, misfit.prior),
             jnp.asarray(_CG_RTOL),
             jnp.asarray(_CG_STEPS if misfit.lateral is None else _CG_STEPS_LATERAL),
+            jnp.asarray(misfit.hopeless),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
         state = _begin(gauss_newton, white, misfit)
@@ -177,7 +190,7 @@ class _Run:
             white, state, aux, done = _step(gauss_newton, white, misfit, state)
             self.solves += 1
             loss, inner = float(state.f_info.as_min()), int(state.descent_state.iterations)
-            self.bar.show(self.solves, loss, self.iterations + inner)
+            self.bar.show(self.solves, loss, self.iterations + inner, float(state.descent_state.change))
             if not bool(jnp.all(aux["followed"])):
                 result = FitStatus.too_many_increments
                 break
@@ -218,22 +231,21 @@ def _step(solver, white, misfit, state):
     return white, state, aux, done
 
 
-def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):
+def _draw(posterior: Posterior, key: PRNGKeyArray):
     """Draw deviations of the unknowns, of normal tractions [MPa] and of the interface [mm]; their share of the data."""
     white, residuals, iterations = posterior.draw(key)
-    _, normal = jax.jvp(misfit.normal, (posterior.white,), (white,))
-    return white, normal, moved(residuals), jnp.sum(residuals["maps"] ** 2), iterations
+    return white, carried(residuals), moved(residuals), jnp.sum(residuals["maps"] ** 2), iterations
 
 
-def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyArray) -> tuple[Misfit, _Reached]:
+def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyArray) -> _Reached:
     """Fit again under other hyper-parameters, each fit from the last, until they settle."""
     low, high = -np.inf, np.inf  # logarithms of factors on the standard deviation that are too small, too large
     factor = 0.0
     for _ in range(_MOST_CHOICES):
         misfit, prior = run.misfit, run.misfit.prior
-        normal = misfit.normal(reached.white)
+        normal = carried(reached.residuals)
         if how == "evidence":
-            around = [_draw(reached.posterior, misfit, one)[1] for one in jax.random.split(key, draws)]
+            around = [_draw(reached.posterior, one)[1] for one in jax.random.split(key, draws)]
             mean = on_nodes(prior, normal.shape[1:])
             chosen, change = most_likely(prior, (normal + jnp.stack(around) - mean).reshape(-1, *mean.shape), misfit)
         else:
@@ -243,17 +255,17 @@ def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyA
             target = (low + step) if np.isfinite(low) else (high - step)
             change, chosen, factor = abs(target - factor), rescaled(prior, np.exp(target - factor)), target
         run.misfit = eqx.tree_at(lambda m: m.prior, misfit, chosen)
-        reached = run.fit(
-            run.misfit.white(normal)._replace(numbers=reached.white.numbers, lateral=reached.white.lateral)
-        )
-        if change < _CHOSEN or bool(reached.result != FitStatus.successful):
+        asking = run.misfit.white(misfit.asked(reached.white))
+        reached = run.fit(asking._replace(numbers=reached.white.numbers, lateral=reached.white.lateral))
+        if change < _CHOSEN or _failed(reached):
             break
-    return run.misfit, reached
+    return reached
 
 
 def _result(
-    misfit: Misfit, reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: FitProgress
+    reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: FitProgress
 ) -> TractionFit:
+    misfit = run.misfit
     palpation, loads = misfit.experiment(reached.white), misfit.tractions(reached.white)
     solutions = [
         solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
@@ -261,7 +273,7 @@ def _result(
     ]
     deviations, moves, whites, dof, iterations = [], [], [], [], 0
     for count, one in enumerate(jax.random.split(key, draws)):
-        white, normal, move, determined, steps = _draw(reached.posterior, misfit, one)
+        white, normal, move, determined, steps = _draw(reached.posterior, one)
         deviations.append(normal)
         moves.append(move)
         whites.append(white)

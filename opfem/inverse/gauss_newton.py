@@ -14,6 +14,10 @@ from jaxtyping import Array, PyTree
 
 # What is left to go, over the posterior's standard deviation along it, below which a direction is not refined [-].
 _NEGLIGIBLE = 0.03
+# A point is accepted where the least of the sum of squares along the way lies beyond this part of it; else the next is
+# that least, but between these parts of the last.
+_BEYOND = 0.6
+_SHORTEST, _LONGEST = 0.1, 0.5
 
 
 class LeastSquares(NamedTuple):
@@ -91,6 +95,7 @@ def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:
 
 class _Direction(eqx.Module):
     newton: Any
+    change: Array  # that it makes to the residuals, over their norm
     iterations: Array  # of all systems so far
     result: optx.RESULTS
 
@@ -102,59 +107,85 @@ class PreconditionedDescent(optx.AbstractDescent):
         precondition: Makes, from J, an approximate inverse of JᵀJ.
         rtol: Relative tolerance of each linear system.
         most: Most iterations of each.
+        hopeless: Half sum of squares from which on no direction is looked for.
     """
 
     precondition: Callable[[Any], Callable[[PyTree], PyTree]]
     rtol: Array
     most: Array
+    hopeless: Array
 
     def init(self, y, f_info_struct):
         """Start without a direction."""
         del f_info_struct
-        return _Direction(y, jnp.zeros((), int), optx.RESULTS.successful)
+        return _Direction(y, jnp.full((), jnp.inf), jnp.zeros((), int), optx.RESULTS.successful)
 
     def query(self, y, f_info, state):
         """Solve for the direction at an accepted point."""
         del y
         J = f_info.jac
         residual = f_info.residual
-        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, self.most, _NEGLIGIBLE)
-        return _Direction(solved.x, state.iterations + solved.iterations, optx.RESULTS.successful)
+        most = jnp.where(f_info.as_min() < self.hopeless, self.most, 0)
+        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, _NEGLIGIBLE)
+        change = plus(residual, solved.rest, -1.0)
+        relative = jnp.sqrt(dot(change, change) / dot(residual, residual))
+        return _Direction(solved.x, relative, state.iterations + solved.iterations, optx.RESULTS.successful)
 
     def step(self, step_size, state):
         """Go a part of the way."""
         return jax.tree.map(lambda v: -step_size * v, state.newton), state.result
 
 
-class _StepSize(eqx.Module):
+class _Search(eqx.Module):
     step_size: Array
+    change: Array  # `_Direction.change`
 
 
-class Halving(optx.AbstractSearch):
-    """Whole steps, halved until the sum of squares falls.
+class Interpolating(optx.AbstractSearch):
+    """Whole steps; where the sum of squares falls by much less than the Jacobian says, back to its least.
 
-    Unlike `optimistix.BacktrackingArmijo` it does not multiply with the Jacobian once more to know by how much.
+    A direction costs tens of products, a look along it one solve. What the Jacobian says comes with the direction:
+    unlike in `optimistix.BacktrackingArmijo`, it is not multiplied with once more.
     """
 
     def init(self, y, f_info_struct):
         """Start with whole steps."""
         del y, f_info_struct
-        return _StepSize(jnp.ones(()))
+        return _Search(jnp.ones(()), jnp.zeros(()))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        """Accept a point that is no worse."""
+        """Accept a point that is no worse, and not far beyond the least of the parabola through it."""
         del y, y_eval
-        accept = first_step | (f_eval_info.as_min() <= f_info.as_min())
-        step_size = jnp.where(accept, 1.0, 0.5 * state.step_size)
-        return step_size, accept, optx.RESULTS.successful, _StepSize(step_size)
+        length, before, now = state.step_size, f_info.as_min(), f_eval_info.as_min()
+        fall = state.change**2 * before  # that a whole step promises; the slope is twice it
+        curvature = (now - before + 2.0 * fall * length) / length**2
+        least = jnp.where(jnp.isfinite(now), fall / jnp.where(curvature > 0, curvature, fall), 0.0)
+        accept = first_step | ((now <= before) & (least >= _BEYOND * length))
+        length = jnp.where(accept, 1.0, jnp.clip(least, _SHORTEST * length, _LONGEST * length))
+        return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 
 class GaussNewton(optx.AbstractGaussNewton):
-    """Gauss–Newton for `optimistix.least_squares`, or for stepping through it."""
+    """Gauss–Newton for `optimistix.least_squares`, or for stepping through it.
+
+    It ends where its next step would change the residuals by less than `rtol` of their norm: in a fit, about what is
+    left to go over the posterior's standard deviations, root mean square. Their own change would be the wrong measure:
+    directions that the data do not tell are never at rest.
+    """
 
     rtol: Array
     atol: Array
     descent: PreconditionedDescent
-    search: Halving = Halving()
+    search: Interpolating = Interpolating()
     norm: Callable = eqx.field(static=True, default=optx.two_norm)
     verbose: Callable = eqx.field(static=True, default=lambda **_: None)
+
+    def step(self, fn, y, args, options, state, tags):
+        """Look at the next point, and go on from there if it is accepted."""
+        state = eqx.tree_at(lambda s: s.search_state.change, state, state.descent_state.change)
+        return super().step(fn, y, args, options, state, tags)
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Tell whether the next step is small."""
+        del fn, y, args, options, tags
+        return state.descent_state.change <= self.rtol, optx.RESULTS.successful

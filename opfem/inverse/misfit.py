@@ -10,17 +10,19 @@ from jaxtyping import Array, Float
 from ..mechanics.face import nodal_area_vector, tributary_area
 from ..model import Palpation, Traction
 from ..solvers import Newton
+from .bed import Bed
 from .data import AxialDisplacement, ForceReading
 from .forward import press
 from .observation import Nodes, Observation, interface_heights
 from .parameters import INDEX, AbstractNumberPrior, with_numbers
+from .posterior import Posterior
 from .preconditioner import Unknowns
 from .prior import AbstractPrior, on_nodes
 
-# Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then halved.
+# Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then shortened.
 _NOT_CARRIED = 1e4
-# Weight [1/mm] of displacements that ride along among the residuals, so that products with the Jacobian give their
-# change too: it weighs nothing.
+# Weight of displacements [1/mm] and tractions [1/MPa] that ride along among the residuals, so that products with the
+# Jacobian give their change too: it weighs nothing.
 _RIDES_ALONG = 1e-9
 
 
@@ -36,6 +38,7 @@ class Misfit(eqx.Module):
         forces: Force readings, stacked; None without.
         inside: Displacements inside the layer, stacked; None without.
         softness: Pressure [MPa] below which a non-negative traction bends towards zero; None: any sign.
+        bed: Springs between the load and the layer; of stiffness 0 for a dead load.
         solver: Settings of the forward solve.
     """
 
@@ -47,7 +50,13 @@ class Misfit(eqx.Module):
     forces: ForceReading | None
     inside: AxialDisplacement | None
     softness: Array | None
+    bed: Bed
     solver: Newton
+
+    @property
+    def hopeless(self) -> float:
+        """The half sum of squares [-] of one map whose traction is not carried."""
+        return 0.5 * _NOT_CARRIED**2 * self.observations.certainty[0].size
 
     def experiment(self, white: Unknowns) -> Palpation:
         """Put the fitted numbers into the experiment."""
@@ -57,8 +66,8 @@ class Misfit(eqx.Module):
         """Compute the fitted numbers."""
         return {name: prior.number(white.numbers[name]) for name, prior in self.parameters.items()}
 
-    def normal(self, white: Unknowns) -> Float[Array, "maps my mx"]:
-        """Compute the normal tractions [MPa] per reference area."""
+    def asked(self, white: Unknowns) -> Float[Array, "maps my mx"]:
+        """Compute the normal tractions [MPa] per reference area that are asked for: a dead load's are carried."""
         return self.latent_to_normal(self.latent(white))
 
     def latent(self, white: Unknowns) -> Float[Array, "maps my mx"]:
@@ -72,7 +81,7 @@ class Misfit(eqx.Module):
         return latent if self.softness is None else self.softness * jax.nn.softplus(latent / self.softness)
 
     def white(self, normal: Float[Array, "maps my mx"]) -> Unknowns:
-        """Find unknowns that give normal tractions [MPa], the others at their priors' centres."""
+        """Find unknowns that ask for normal tractions [MPa], the others at their priors' centres."""
         maps, *shape = normal.shape
         if self.softness is not None:
             # The inverse of softplus, from a little above zero.
@@ -86,12 +95,13 @@ class Misfit(eqx.Module):
 
     def tractions(self, white: Unknowns) -> Traction:
         """Compute the load of every map, stacked."""
+        dead, stiffness = self.bed.load(self.asked(white)), self.bed.stiffness
         if self.lateral is None or white.lateral is None:
-            return jax.vmap(Traction)(self.normal(white))
+            return jax.vmap(lambda normal: Traction(normal, None, stiffness))(dead)
         spacing, prior = self.palpation.mesh().spacing, self.lateral
         mean = on_nodes(prior, white.lateral.shape[1:])
         lateral = mean + jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
-        return jax.vmap(Traction)(self.normal(white), lateral)
+        return jax.vmap(lambda normal, lateral: Traction(normal, lateral, stiffness))(dead, lateral)
 
     def __call__(self, white: Unknowns, exact: bool = False) -> tuple[dict[str, Any], dict[str, Array]]:
         """Compute standardised residuals by source, and how the solves went; derivatives as `press` has them."""
@@ -107,17 +117,21 @@ class Misfit(eqx.Module):
 
         loads = self.tractions(white)
         misfit, heights, pressed = _one_by_one(one, (self.observations, loads))
+        normal = self.bed.carried(loads.normal, pressed.u[:, 2, -1])
+        # Springs add to what is asked for.
+        added = jax.vmap(lambda part: self.prior.whiten(part, spacing))(normal - self.asked(white))
         residuals = {
             "maps": misfit,
-            "prior": jax.vmap(lambda part: self.prior.held(part, spacing))(white.normal),
+            "prior": jax.vmap(lambda part: self.prior.held(part, spacing))(white.normal + added),
             "numbers": white.numbers,
-            "rides": _RIDES_ALONG * pressed.u[:, :, -1],
+            "moved": _RIDES_ALONG * pressed.u[:, :, -1],
+            "normal": _RIDES_ALONG * normal,
         }
         if self.lateral is not None:
             prior = self.lateral
             residuals["lateral"] = jax.vmap(jax.vmap(lambda part: prior.held(part, spacing)))(white.lateral)
         if self.forces is not None:
-            total = jnp.sum(loads.normal * tributary_area(mesh.positions()[:, -1]), axis=(1, 2))
+            total = jnp.sum(normal * tributary_area(mesh.positions()[:, -1]), axis=(1, 2))
             residuals["forces"] = (total - self.forces.force) / self.forces.std
         if self.inside is not None:
             std = self.inside.std
@@ -155,7 +169,21 @@ def pressure_change(
 
 def moved(residuals: dict[str, Any]) -> Float[Array, "maps 3 my mx"]:
     """Take the interface's displacement, or its change [mm], from residuals or their change."""
-    return residuals["rides"] / _RIDES_ALONG
+    return residuals["moved"] / _RIDES_ALONG
+
+
+def carried(residuals: dict[str, Any]) -> Float[Array, "maps my mx"]:
+    """Take the normal traction that the layer carries, or its change [MPa], from residuals or their change."""
+    return residuals["normal"] / _RIDES_ALONG
+
+
+@eqx.filter_jit
+def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:
+    """Multiply the posterior covariance of the normal traction with weights [-]."""
+    nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), posterior.residual_structure())
+    J = posterior.jacobian
+    pulled = J.T.mv({**nothing, "normal": weights / _RIDES_ALONG})
+    return carried(J.mv(posterior.covariance(pulled)))
 
 
 def _one_by_one(function, stacked):

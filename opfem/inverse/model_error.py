@@ -39,7 +39,8 @@ def mesh_error(solution: Solution, solver: Newton = Newton()) -> Float[Array, "h
         raise ValueError(f"mesh_error needs even numbers of elements (nx, ny, nz), got {palpation.elements}.")
     nx, ny, nz = palpation.elements
     half = dataclasses.replace(palpation, elements=(nx // 2, ny // 2, nz // 2))
-    coarse = solve(half, jax.tree.map(_every_other, load), solver, progress=False)
+    dead = Traction(-solution.traction[2], load.lateral)
+    coarse = solve(half, jax.tree.map(_every_other, dead), solver, progress=False)
     fine = interface_heights(palpation.mesh(), solution.displacement[:, -1])
     return (interface_heights(half.mesh(), coarse.displacement[:, -1]) - _every_other(fine)) / _SECOND_ORDER
 

@@ -38,6 +38,11 @@ class Unknowns(NamedTuple):
     numbers: dict[str, Array]
 
 
+def indentation(gain: Nodes, softness: Nodes, normal: Nodes) -> Nodes:
+    """Compute the small-strain indentation [mm] under a normal traction [MPa], of a layer as thick as it is locally."""
+    return softness * from_cosines(gain * cosine_transform(normal))
+
+
 class LayerNormal(eqx.Module):
     """Approximate normal matrix of misfit and prior for each map; calling that of one multiplies with its inverse.
 
@@ -59,16 +64,15 @@ class LayerNormal(eqx.Module):
         """Multiply with the inverse, to 1e-3."""
         held = jnp.asarray(self.prior.penalised(gradient.shape)) ** 2
         spread = self.prior.mode_std(wave_numbers(gradient.shape, self.spacing), self.spacing)
-        weight = self.softness**2 * self.precision
-        diagonal = held + (spread * self.gain) ** 2 * jnp.mean(weight)
+        diagonal = held + (spread * self.gain) ** 2 * jnp.mean(self.softness**2 * self.precision)
 
-        def indentation(white):
-            return from_cosines(self.gain * cosine_transform(self.prior.expand(white, self.spacing)))
+        def indented(white):
+            return indentation(self.gain, self.softness, self.prior.expand(white, self.spacing))
 
-        _, pull = jax.vjp(indentation, jnp.zeros_like(gradient))
+        _, pull = jax.vjp(indented, jnp.zeros_like(gradient))
 
         def multiply(white):
-            return held * white + pull(weight * indentation(white))[0]
+            return held * white + pull(self.precision * indented(white))[0]
 
         return jax.scipy.sparse.linalg.cg(
             multiply, gradient, tol=_RTOL, atol=0.0, maxiter=_STEPS, M=lambda r: r / diagonal

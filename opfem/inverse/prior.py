@@ -61,10 +61,10 @@ class AbstractPrior(eqx.Module):
         return self.scale(white.shape, spacing) * from_cosines(modes)
 
     def whiten(self, deviation: Nodes, spacing: Spacing) -> Nodes:
-        """Turn deviations from the mean into white unknowns: the inverse of `expand`."""
-        k = wave_numbers(deviation.shape, spacing)
+        """Turn deviations from the mean into white unknowns: the inverse of `expand`, but for waves it excludes."""
+        std = self.mode_std(wave_numbers(deviation.shape, spacing), spacing)
         modes = cosine_transform(deviation / self.scale(deviation.shape, spacing))
-        return modes / self.mode_std(k, spacing)
+        return jnp.where(std > 0, modes / jnp.where(std > 0, std, 1.0), 0.0)
 
 
 class Matern(AbstractPrior):

@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .misfit import Misfit
+from .misfit import Misfit, carried
 from .posterior import Posterior
 from .preconditioner import Unknowns
 
 # Points along each axis.
 _GRID = 4
+# Passes that find what to ask of a bed of springs so that the layer carries a change at single points.
+_PASSES = 4
 # Full width at half maximum over the standard deviation of a Gaussian.
 _FWHM = np.sqrt(8.0 * np.log(2.0))
 
@@ -48,13 +50,17 @@ def _image(posterior: Posterior, misfit: Misfit, points: Array) -> Array:
     """Fit the change of the maps that a change of the traction at some nodes makes."""
     spacing, prior = misfit.palpation.mesh().spacing, misfit.prior
     slope = jax.jvp(misfit.latent_to_normal, (misfit.latent(posterior.white),), (jnp.ones_like(points),))[1]
-    white = jax.vmap(lambda part: prior.whiten(part, spacing))(points / slope)
-    nothing = jax.tree.map(jnp.zeros_like, posterior.white)
-    # Waves that the prior excludes altogether are in no truth either.
-    change = nothing._replace(normal=jnp.where(jnp.isfinite(white), white, 0.0))
+
+    def asked(points):
+        return jax.vmap(lambda part: prior.whiten(part, spacing))(points / slope)
+
+    change = jax.tree.map(jnp.zeros_like, posterior.white)._replace(normal=asked(points))
     residuals = _multiply(posterior, change)
+    for _ in range(_PASSES):
+        change = change._replace(normal=change.normal + asked(points - carried(residuals)))
+        residuals = _multiply(posterior, change)
     told = {name: part if name == "maps" else jax.tree.map(jnp.zeros_like, part) for name, part in residuals.items()}
-    return jax.jvp(misfit.normal, (posterior.white,), (posterior.solve(told).x,))[1]
+    return carried(_multiply(posterior, posterior.solve(told).x))
 
 
 @eqx.filter_jit

@@ -10,9 +10,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..measurement import ThicknessMap
 from ..solvers import Solution
-from .misfit import Misfit
+from .misfit import Misfit, carried, normal_covariance
 from .posterior import Posterior
-from .preconditioner import Unknowns
 from .prior import AbstractPrior
 
 # A direction counts as not observed when the data leave it this part of its standard deviation before.
@@ -55,7 +54,9 @@ class TractionFit(eqx.Module):
     """The traction fitted to a measured map, or to several: arrays then have a leading axis, one entry per map.
 
     Attributes:
-        solution: The layer under the fitted traction, solved to the solver's own tolerance.
+        solution: The layer under the fitted traction, solved to the solver's own tolerance. Its load is a dead one or,
+            where the layer would snap on its way under that, pressed by springs (`Traction.stiffness`): `traction` is
+            what the layer carries.
         pressure_std: Posterior standard deviation of `pressure`, on the current area [MPa].
         normal_std: The same of the normal traction, per reference area [MPa].
         chi2: Sum of squared misfits between interface and measured surface over their noise, of all maps [-].
@@ -174,8 +175,8 @@ class TractionFit(eqx.Module):
             key: Random key.
             n: How many.
         """
-        drawn = jnp.stack([_draw(self.posterior, self.misfit, one) for one in jax.random.split(key, n)])
-        return self._like_normal(drawn)
+        drawn = jnp.stack([carried(self.posterior.draw(one)[1]) for one in jax.random.split(key, n)])
+        return self.normal + self._like_normal(drawn)
 
     def covariance(self, weights: Float[Array, "*maps my mx"]) -> Float[Array, "*maps my mx"]:
         """Multiply the posterior covariance of the normal traction with weights: Cov(p, Σ weights p).
@@ -186,7 +187,7 @@ class TractionFit(eqx.Module):
             weights: Of every node `(ny+1, nx+1)` [-].
         """
         stacked = weights.reshape(self.posterior.white.normal.shape)
-        return self._like_normal(_normal_covariance(self.posterior, self.misfit, stacked)[None])[0]
+        return self._like_normal(normal_covariance(self.posterior, stacked)[None])[0]
 
     def unobserved(self) -> dict[str, tuple[float, float]]:
         """Name what the maps do not tell: directions that keep over half of their standard deviation before the fit.
@@ -204,8 +205,9 @@ class TractionFit(eqx.Module):
         for i in range(shape[0]):
             for name, mode in _MODES.items():
                 weights = jnp.zeros(shape).at[i].set(_cosine(shape[1:], mode))
-                after = jnp.sqrt(jnp.sum(weights * _normal_covariance(self.posterior, self.misfit, weights)))
-                before = jnp.sqrt(jnp.sum(_prior_pull(self.posterior, self.misfit, weights).normal ** 2))
+                after = jnp.sqrt(jnp.sum(weights * normal_covariance(self.posterior, weights)))
+                pulled = jax.vjp(self.misfit.asked, self.posterior.white)[1](weights)[0]
+                before = jnp.sqrt(jnp.sum(pulled.normal**2))
                 label = name if shape[0] == 1 else f"{name} of map {i}"
                 # What the prior does not hold has no standard deviation before the fit.
                 penalised = self.prior.penalised(shape[1:])[mode] == 1.0
@@ -220,8 +222,7 @@ class TractionFit(eqx.Module):
 
     def _like_normal(self, stacked: Float[Array, "n maps my mx"]) -> Array:
         """Add nothing to draws of several maps; of a single one take the axis of maps away."""
-        normal = self.misfit.normal(self.posterior.white)
-        return stacked if self.residual.ndim == 3 else stacked.reshape(stacked.shape[0], *normal.shape[1:])
+        return stacked if self.residual.ndim == 3 else stacked[:, 0]
 
 
 def _direction_name(names: list[str], direction: np.ndarray) -> str:
@@ -230,20 +231,6 @@ def _direction_name(names: list[str], direction: np.ndarray) -> str:
     parts = direction[order] / direction[order[0]]
     others = [(part, names[i]) for part, i in zip(parts[1:], order[1:], strict=True) if abs(part) > _MATTERS]
     return names[order[0]] + "".join(f" {'+' if part > 0 else '-'} {abs(part):.2g} {name}" for part, name in others)
-
-
-def _draw(posterior: Posterior, misfit: Misfit, key: PRNGKeyArray):
-    normal, change = jax.jvp(misfit.normal, (posterior.white,), (posterior.draw(key)[0],))
-    return normal + change
-
-
-def _normal_covariance(posterior: Posterior, misfit: Misfit, weights: Array) -> Array:
-    pulled = _prior_pull(posterior, misfit, weights)
-    return jax.jvp(misfit.normal, (posterior.white,), (posterior.covariance(pulled),))[1]
-
-
-def _prior_pull(posterior: Posterior, misfit: Misfit, weights: Array) -> Unknowns:
-    return jax.vjp(misfit.normal, posterior.white)[1](weights)[0]
 
 
 def _cosine(shape: tuple[int, ...], mode: tuple[int, int]) -> Array:

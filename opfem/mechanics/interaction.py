@@ -143,22 +143,33 @@ class RigidPatches(eqx.Module):
 
 
 class ImposedPressure(eqx.Module):
-    """A dead pressure per reference area, applied elsewhere, that bounds friction here.
+    """A pressure per reference area that bounds friction: a dead one, applied elsewhere, and a bed of springs.
 
     Attributes:
-        start: Pressure at the corners of the faces at load fraction 0 `(4, *faces)` [MPa].
+        start: Dead pressure at the corners of the faces at load fraction 0 `(4, *faces)` [MPa].
         end: The same at load fraction 1.
         area: Reference area per unit of (ξ, η) at the points [mm²].
+        height: Of the points where the springs are at rest [mm]; None: there are no springs.
+        stiffness: Of the springs at load fractions 0 and 1 [MPa/mm].
     """
 
     start: Float[Array, "4 *faces"]
     end: Float[Array, "4 *faces"]
     area: Float[Array, "points *faces"]
+    height: Float[Array, "points *faces"] | None = None
+    stiffness: tuple[Array, Array] | None = None
 
-    def at_points(self, fraction: Array, rule: FaceRule) -> Float[Array, "points *faces"]:
-        """Interpolate the pressure [MPa] at the points; tension bounds friction by zero."""
+    def springs(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
+        """Compute the springs' pressure [MPa] at heights [mm]; negative where they pull."""
+        if self.height is None or self.stiffness is None:
+            return jnp.zeros_like(z)
+        start, end = self.stiffness
+        return ((1.0 - fraction) * start + fraction * end) * (z - self.height)
+
+    def bounding(self, fraction: Array, rule: FaceRule, springs: Array | float) -> Float[Array, "points *faces"]:
+        """Compute the pressure [MPa] at the points with that of the springs; tension bounds friction by zero."""
         corners = (1.0 - fraction) * self.start + fraction * self.end
-        return jnp.maximum(contract(quadrature(rule).N, corners), 0.0)
+        return jnp.maximum(contract(quadrature(rule).N, corners) + springs, 0.0)
 
 
 class ContactFace(eqx.Module):
@@ -168,7 +179,7 @@ class ContactFace(eqx.Module):
         contact: Law and friction.
         surface: The rigid surface.
         offset: Shift of the surface away from the layer [mm].
-        imposed: For a `Traction` load, whose dead pressure only bounds friction.
+        imposed: For a `Traction` load, whose dead pressure only bounds friction, and whose springs push.
         element_size: Size of an element [mm]; default elastic slip is a fraction of it.
         stiffness: Stiffness of an element per area [MPa/mm], the scale of hard contact.
         above: True for the sample, False for the window.
@@ -205,10 +216,9 @@ class ContactFace(eqx.Module):
         stretch = jnp.sqrt(1.0 + slope_x**2 + slope_y**2)
         normal = jnp.stack([-slope_x, -slope_y, jnp.ones_like(slope_x)]) / stretch
         clearance = (side * (height - position[2]) + self.offset) / stretch
-        pressure, stiffness = self._pressure(fraction, clearance, law or self._law(history))
+        pressure, push, stiffness = self._pressure(fraction, position[2], clearance, law or self._law(history))
         friction = self._friction(pressure, position, history, slope_x, slope_y, None if law is None else law.sticks)
-        push = 0.0 if self.imposed is not None else side * pressure
-        traction = friction.traction - push * normal
+        traction = friction.traction - side * push * normal
         eye = jnp.eye(3, dtype=position.dtype).reshape(3, 3, *[1] * pressure.ndim)
         along = normal[:, None] * normal[None]
         slid_along = friction.direction[:, None] * friction.direction[None]
@@ -245,11 +255,13 @@ class ContactFace(eqx.Module):
         gap = self.contact.law.clearance(after.pressure - before.pressure, self.stiffness)
         return jnp.max(jnp.where(after.pressure > 0, jnp.abs(gap), 0.0))
 
-    def _pressure(self, fraction: Array, clearance: Array, law) -> tuple[Array, Array]:
+    def _pressure(self, fraction: Array, z: Array, clearance: Array, law) -> tuple[Array, Array, Array]:
+        """Compute the pressure that bounds friction, that which pushes, and how fast it rises [MPa/mm]."""
         if self.imposed is not None:
-            return self.imposed.at_points(fraction, self.rule), jnp.zeros_like(clearance)
+            push, slope = jax.jvp(lambda z: self.imposed.springs(fraction, z), (z,), (jnp.ones_like(z),))
+            return self.imposed.bounding(fraction, self.rule, push), push, slope
         pressure, slope = jax.jvp(law, (clearance,), (jnp.ones_like(clearance),))
-        return pressure, -slope
+        return pressure, pressure, -slope
 
     def initial_iterate(self, history: SlipHistory) -> ContactIterate:
         """Start from the pressure of the last increment, as if every point had stuck."""

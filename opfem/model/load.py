@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_finite, concrete
+from .._checks import as_leaf, check_finite, check_non_negative, concrete
 from ..measurement import ThicknessMap
 from .surface import INTERPOLATIONS, Interpolation
 
@@ -47,20 +47,26 @@ class Imprint(eqx.Module):
 
 
 class Traction(eqx.Module):
-    """Apply a dead load to the interface: force on the layer per reference area, fixed axes.
+    """Apply a load to the interface: force on the layer per reference area, fixed axes.
+
+    A dead load, unless it has a stiffness: then a bed of springs holds every node on its way, and a layer that
+    would snap under the dead load does not.
 
     Args:
         normal: Pressure-like part [MPa], positive in compression (its force points to -z):
             a number, or interface nodes `(ny+1, nx+1)`.
         lateral: `(2, ny+1, nx+1)` [MPa], x then y. None: Coulomb friction against a sample
             fixed in x and y, bounded by the sample's friction × normal.
+        stiffness: Of the bed [MPa/mm]: at a displacement u_z the normal part is normal + stiffness × u_z. None: a
+            dead load.
 
     Raises:
-        ValueError: If a value is not finite or a shape is wrong.
+        ValueError: If a value is not finite, a shape is wrong, or the stiffness is negative.
     """
 
     normal: Array = eqx.field(converter=as_leaf)
     lateral: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    stiffness: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
 
     def __check_init__(self):
         check_finite("Traction.normal", "MPa", self.normal)
@@ -72,6 +78,8 @@ class Traction(eqx.Module):
                 raise ValueError(
                     f"Traction.lateral [MPa] must be (2, ny+1, nx+1), x then y, got shape {self.lateral.shape}."
                 )
+        if self.stiffness is not None:
+            check_non_negative("Traction.stiffness", "MPa/mm", self.stiffness)
 
 
 class Displacement(eqx.Module):

@@ -66,7 +66,8 @@ def linearise_path(problem: Problem, start: State, path: Path, length: Array, se
     """Go through recorded solves again, for `jax.linearize`: first derivatives only, and to 1e-3.
 
     The tangent and the multigrid of every slot of the path are kept, so that a product with the Jacobian costs
-    little more than its linear solves.
+    little more than its linear solves. For loads only: one correction does not carry what a change of prescribed
+    displacements does to the rest.
 
     Returns:
         As `follow_path`.

@@ -80,11 +80,16 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         area = tributary_area(X[:, -1], cells)
         first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
-        if load.lateral is None:
-            _, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
+        stiffness = _stiffness(load, start)
+        if load.lateral is None or stiffness is not None:
+            at, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
             start_normal, end_normal = (gather_face(-end[2:]).reshape(4, -1) for end in (first, last))
-            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)))
-            sample = face(palpation.sample, plane, True, imposed=pressure, rule="nodes")
+            springs = () if stiffness is None else (at[2], stiffness)
+            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), *springs)
+            contact = _contact(palpation.sample)
+            if load.lateral is not None:
+                contact = dataclasses.replace(contact, friction=0.0)
+            sample = face(contact, plane, True, imposed=pressure, rule="nodes")
     else:
         first, last = (_displacement(end if isinstance(end, Displacement) else None, mesh) for end in (start, load))
         imposed = (first, last)
@@ -173,6 +178,15 @@ def _traction(load: Traction | None, mesh: LayerMesh) -> Array:
             raise ValueError(f"Traction.lateral [MPa] must be {(2, *shape)}, got {load.lateral.shape}.")
         lateral = load.lateral
     return jnp.concatenate([lateral, -normal[None]])
+
+
+def _stiffness(load: Traction, start: Load | None) -> tuple[Array, Array] | None:
+    """Return the stiffness of the bed [MPa/mm] at both ends; None where there is no bed."""
+    first = start.stiffness if isinstance(start, Traction) else load.stiffness
+    if first is None and load.stiffness is None:
+        return None
+    none = jnp.zeros_like(load.normal, shape=())
+    return none if first is None else first, none if load.stiffness is None else load.stiffness
 
 
 def _displacement(load: Displacement | None, mesh: LayerMesh) -> Array:

@@ -144,6 +144,11 @@ def solve_explicit(
             "Explicit cannot shift out the approach of the contact law: it would need a second run. Pass "
             "Imprint(..., correct_approach=False), or solve with Newton()."
         )
+    if getattr(load, "stiffness", None) is not None:
+        raise ValueError(
+            "Explicit takes dead loads: pass Traction(stiffness=None), or solve with Newton(), got Traction.stiffness "
+            "[MPa/mm]."
+        )
     first = None if start is None else start.last_converged.state
     if first is not None and not isinstance(first, Motion):
         raise ValueError(

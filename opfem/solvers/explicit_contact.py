@@ -151,7 +151,7 @@ def imposed_force(face: ContactFace, fraction: Array, shape: tuple[int, int]) ->
     """Compute the dead normal force of a node [N] that bounds its friction."""
     assert face.imposed is not None
     ny, nx = shape[0] - 1, shape[1] - 1
-    pressure = face.imposed.at_points(fraction, face.rule) * face.imposed.area
+    pressure = face.imposed.bounding(fraction, face.rule, 0.0) * face.imposed.area
     return to_nodes(pressure.reshape(-1, ny, nx), face.rule)
 
 

@@ -69,9 +69,10 @@ class FitProgress:
     ) -> None:
         self._bar.stop()
 
-    def show(self, step: int, loss: float, inner: int) -> None:
+    def show(self, step: int, loss: float, inner: int, left: float) -> None:
         """Update the line."""
-        self._bar.update(self._task, description=f"solve {step}, misfit {loss:.5g}, {inner} inner iterations")
+        text = f"solve {step}, misfit {loss:.5g}, {inner} inner iterations, {left:.2g} to go"
+        self._bar.update(self._task, description=text)
 
     def drawn(self, count: int, draws: int) -> None:
         """Update the line while the posterior is drawn from."""

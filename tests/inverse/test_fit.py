@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import opfem as op
+import opfem.inverse.fit
 from opfem.inverse.forward import press
 from opfem.inverse.observation import _spline_values, interface_heights
 from opfem.inverse.start import on_mesh
@@ -132,31 +133,40 @@ def test_covariance_agrees_with_draws(fit):
     assert jnp.mean(samples**2) == pytest.approx(variance, rel=4 * np.sqrt(2 / n))
 
 
+def dead_load(field):
+    return op.Traction(3e-3 + 1e-3 * field)
+
+
+def on_springs(field):
+    return op.Traction(0.02 + 1e-3 * field, stiffness=0.3)
+
+
 @pytest.mark.slow
-def test_jacobian_of_the_fit_against_exact_derivatives():
+@pytest.mark.parametrize("load", [dead_load, on_springs])
+def test_jacobian_of_the_fit_against_exact_derivatives(load):
     """Kept tangents give products to 1e-3 of those through `follow_path`, forward and transposed."""
     experiment, settings = palpation((6, 6, 2)), op.Newton(max_path=12).as_leaves()
-    normal = 3e-3 + 1e-3 * jax.random.normal(jax.random.key(0), (7, 7))
+    field = jax.random.normal(jax.random.key(0), (7, 7))
     change = jax.random.normal(jax.random.key(1), (7, 7))
 
-    def exact(normal):
-        problem = discretise(experiment, op.Traction(normal), None, settings.face_rule)
+    def exact(field):
+        problem = discretise(experiment, load(field), None, settings.face_rule)
         frozen = jax.lax.stop_gradient(problem)
         end = jax.lax.while_loop(
             unfinished, lambda s: attempt(frozen, s, settings), begin(frozen.initial_state(), settings, True)
         )
         return follow_path(problem, problem.initial_state(), end.path, end.kept, settings)[1].u[:, -1]
 
-    def kept(normal):
-        return press(experiment, op.Traction(normal), settings).u[:, -1]
+    def kept(field):
+        return press(experiment, load(field), settings).u[:, -1]
 
-    u, expected = jax.jit(lambda p: jax.jvp(exact, (p,), (change,)))(normal)
-    v, slope = jax.jit(lambda p: jax.jvp(kept, (p,), (change,)))(normal)
+    u, expected = jax.jit(lambda p: jax.jvp(exact, (p,), (change,)))(field)
+    v, slope = jax.jit(lambda p: jax.jvp(kept, (p,), (change,)))(field)
     assert v == pytest.approx(np.asarray(u), abs=1e-12)
     assert jnp.linalg.norm(slope - expected) < 3e-3 * jnp.linalg.norm(expected)
     weights = jax.random.normal(jax.random.key(2), u.shape)
-    pulled = jax.jit(lambda p: jax.vjp(kept, p)[1](weights)[0])(normal)
-    reference = jax.jit(lambda p: jax.vjp(exact, p)[1](weights)[0])(normal)
+    pulled = jax.jit(lambda p: jax.vjp(kept, p)[1](weights)[0])(field)
+    reference = jax.jit(lambda p: jax.vjp(exact, p)[1](weights)[0])(field)
     assert jnp.linalg.norm(pulled - reference) < 3e-3 * jnp.linalg.norm(reference)
 
 
@@ -238,6 +248,31 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
             functional(*(a + s * h * d for a, d in zip(at, direction, strict=True)))[0] for s in (1.0, -1.0)
         )
         assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-4)
+
+
+@pytest.mark.slow
+def test_springs_change_nothing_but_the_way(small, monkeypatch):
+    experiment, settings, prior, _ = small
+    thickness = small_map(small)
+    dead = op.fit_traction(experiment, thickness, prior, solver=settings, draws=2, progress=False)
+    # What the fit does where the layer does not carry the estimate that it starts from.
+    fit_once = opfem.inverse.fit._Run.fit
+
+    def not_without_springs(run, white):
+        reached = fit_once(run, white)
+        return reached if run.misfit.bed.stiffness > 0 else reached._replace(result=op.FitStatus.not_carried)
+
+    monkeypatch.setattr(opfem.inverse.fit._Run, "fit", not_without_springs)
+    held = op.fit_traction(experiment, thickness, prior, solver=settings, draws=2, progress=False)
+    assert dead.misfit.bed.stiffness == 0.0
+    assert held.misfit.bed.stiffness > 0.0
+    # Friction depends a little on the way to the load.
+    assert jnp.linalg.norm(held.normal - dead.normal) < 0.1 * jnp.linalg.norm(dead.normal_std)
+    assert held.chi2 == pytest.approx(float(dead.chi2), rel=1e-2)
+    assert held.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
+    assert held.normal_std == pytest.approx(np.asarray(dead.normal_std), rel=0.05)
+    weights = jnp.zeros((7, 7)).at[2:4, 1:4].set(1.0 / 6)
+    assert held.covariance(weights) == pytest.approx(np.asarray(dead.covariance(weights)), rel=0.05, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -249,6 +249,17 @@ OTHER_FACES = {
             jnp.zeros((4, NY, NX)), gather_face(jnp.array(0.1 + x[2:]))[:, 0], jnp.full((4, NY, NX), 0.2)
         ),
     ),
+    "bed of springs": lambda x: contact_face(
+        op.Contact(EXPONENTIAL, 0.3),
+        above=True,
+        rule="nodes",
+        imposed=ImposedPressure(
+            *jnp.zeros((2, 4, NY, NX)),
+            jnp.full((4, NY, NX), 0.2),
+            gather_face(jnp.array(x[2:]))[:, 0] - 0.1,
+            (jnp.asarray(0.3), jnp.asarray(0.7)),
+        ),
+    ),
 }
 
 
@@ -524,10 +535,20 @@ def test_dead_pressure_bounds_friction_and_does_not_press():
     for z in (-3.0, 3.0):
         total = np.asarray(_force(face, moved(UNIT, x=0.5, z=z), history)).sum(axis=(1, 2))
         np.testing.assert_allclose(total, [-0.3 * 0.2 * 2.0, 0.0, 0.0], ROUNDOFF, ROUNDOFF)
-    halfway = imposed.at_points(jnp.asarray(0.5), "nodes")
-    np.testing.assert_allclose(halfway, 0.1, ROUNDOFF)
+    np.testing.assert_allclose(imposed.bounding(jnp.asarray(0.5), "nodes", 0.0), 0.1, ROUNDOFF)
     pulling = ImposedPressure(0.0 * pressure, -pressure, imposed.area)
-    np.testing.assert_array_equal(pulling.at_points(NOW, "nodes"), 0.0)
+    np.testing.assert_array_equal(pulling.bounding(NOW, "nodes", 0.0), 0.0)
+
+
+def test_springs_press_and_bound_friction_with_what_they_press():
+    """Springs of 0.4 MPa/mm, pressed by 0.5 mm under a dead 0.2 MPa: 0.2 MPa of their own, 0.4 MPa in all."""
+    dead, area = jnp.full((4, 1, 1), 0.2), jnp.full((4, 1, 1), 2.0)
+    imposed = ImposedPressure(0.0 * dead, dead, area, jnp.zeros((4, 1, 1)), (jnp.asarray(0.0), jnp.asarray(0.4)))
+    face = contact_face(op.Contact(EXPONENTIAL, 0.3), above=True, rule="nodes", imposed=imposed)
+    history = face.initial_history(gather_face(jnp.array(UNIT)))
+    raised = 0.5 - float(UNIT[2].max())
+    total = np.asarray(_force(face, moved(UNIT, x=0.5, z=raised), history)).sum(axis=(1, 2))
+    np.testing.assert_allclose(total, [-0.3 * 0.4 * 2.0, 0.0, -0.2 * 2.0], ROUNDOFF, ROUNDOFF)
 
 
 def test_jit_equals_eager_and_vmap_a_loop(rough):

@@ -68,6 +68,7 @@ def test_displacement_takes_a_number_or_nodes(uz):
         (lambda: op.Traction(np.array([[0.1, np.inf]])), r"Traction\.normal \[MPa\] must be finite, got values from"),
         (lambda: op.Traction(np.ones(4)), r"Traction\.normal \[MPa\] must be a number or .*, got shape \(4,\)\."),
         (lambda: op.Traction(0.1, lateral=np.ones((3, 4))), r"\(2, ny\+1, nx\+1\), x then y, got shape \(3, 4\)\."),
+        (lambda: op.Traction(0.1, stiffness=-1.0), r"Traction\.stiffness \[MPa/mm\] must be zero or positive"),
         (lambda: op.Traction(0.1, lateral=np.ones((3, 3, 4))), r"x then y, got shape \(3, 3, 4\)\."),
         (
             lambda: op.Traction(0.1, lateral=np.full((2, 3, 4), np.nan)),

@@ -76,6 +76,11 @@ def test_traced_solve_gives_what_the_host_loop_gives():
     np.testing.assert_allclose(traced.displacement, plain.displacement, atol=2e-3 * 0.11)
 
 
+def test_springs_behind_a_traction_are_refused():
+    with pytest.raises(ValueError, match=r"Explicit takes dead loads.*Traction\.stiffness \[MPa/mm\]"):
+        op.solve(palpation(), op.Traction(1e-3, stiffness=0.1), QUICK)
+
+
 def test_traced_solve_needs_an_increment():
     with pytest.raises(ValueError, match=r"Explicit\.increment"):
         jax.jit(lambda c10: op.solve(palpation(c10), op.Imprint(bump()), QUICK).pressure)(MATERIAL["c10"])

@@ -18,7 +18,7 @@ def palpation(window=0.15, sample=0.05, material=MATERIAL, **options) -> op.Palp
     return op.Palpation(
         op.Layer(0.5, material),
         SIZE,
-        window=op.Contact(HARD, window),
+        window=window if isinstance(window, op.Bonded) else op.Contact(HARD, window),
         sample=op.Contact(EXPONENTIAL, sample),
         **options,
     )
@@ -167,6 +167,25 @@ def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
     assert float(snap.viscosity) == 0.0
     assert float(snap.residual) <= 1e-7
     np.testing.assert_allclose(snap.state.u, direct.state.u, atol=SOLVER)
+
+
+@pytest.mark.parametrize("rubs", [True, False])
+def test_a_bed_of_springs_carries_the_layer_as_a_dead_load_does(rubs):
+    y, x = np.meshgrid(np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, 9), indexing="ij")
+    normal = 4e-3 + 3e-3 * np.cos(np.pi * x) * np.cos(2.0 * np.pi * y)
+    lateral = None if rubs else np.stack([2e-4 * y, -1e-4 * x])
+    experiment = palpation(window=op.Bonded())
+    dead = op.solve(experiment, op.Traction(normal, lateral))
+    behind = normal - 0.3 * dead.displacement[2, -1]
+    held = op.solve(experiment, op.Traction(behind, lateral, stiffness=0.3))
+    apart = jnp.abs(held.displacement - dead.displacement).max() / jnp.abs(dead.displacement).max()
+    # Friction depends on the way there, and the bed's pressure rises in another way.
+    assert apart < (1e-2 if rubs else 1e-5)
+    assert jnp.abs(held.traction[2] + normal).max() < (1e-2 if rubs else 1e-5) * normal.max()
+    assert imbalance(held) < 1e-6
+    # Without the springs it stays where it is.
+    let_go = op.solve(experiment, op.Traction(-held.traction[2], lateral), start=held)
+    assert jnp.abs(let_go.displacement - held.displacement).max() < 1e-4 * jnp.abs(held.displacement).max()
 
 
 def test_start_continues_with_history():

@@ -29,6 +29,7 @@ CASES = {
     "rollers and bonded": problem_of(
         op.Displacement(-0.05), op.Bonded(), op.Roller(), sides={"x0": "roller", "y1": "roller"}
     ),
+    "bed of springs": problem_of(op.Traction(0.002, stiffness=0.05)),
     "hybrid": problem_of(element="hybrid", material=op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=jnp.inf)),
     "tet10": problem_of(element="tet10", hold=0.3),
     "reduced": problem_of(op.Traction(0.002), op.Bonded(), element="reduced"),
