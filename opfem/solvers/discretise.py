@@ -80,11 +80,11 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         area = tributary_area(X[:, -1], cells)
         first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
-        stiffness = _stiffness(load, start)
-        if load.lateral is None or stiffness is not None:
+        bed = _bed(load, start)
+        if load.lateral is None or bed is not None:
             at, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
             start_normal, end_normal = (gather_face(-end[2:]).reshape(4, -1) for end in (first, last))
-            springs = () if stiffness is None else (at[2], stiffness)
+            springs = () if bed is None else (at[2], bed)
             pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), *springs)
             contact = _contact(palpation.sample)
             if load.lateral is not None:
@@ -180,7 +180,7 @@ def _traction(load: Traction | None, mesh: LayerMesh) -> Array:
     return jnp.concatenate([lateral, -normal[None]])
 
 
-def _stiffness(load: Traction, start: Load | None) -> tuple[Array, Array] | None:
+def _bed(load: Traction, start: Load | None) -> tuple[Array, Array] | None:
     """Return the stiffness of the bed [MPa/mm] at both ends; None where there is no bed."""
     first = start.stiffness if isinstance(start, Traction) else load.stiffness
     if first is None and load.stiffness is None:
