@@ -139,10 +139,10 @@ def fit_traction(
             # The layer snaps on its way under a dead load: hold it, and start from the imprint.
             run.misfit = eqx.tree_at(lambda m: m.bed, misfit, bed)
             reached = run.fit(misfit.white(bed.normal))
-        elif _failed(reached) and prior.mean is not None:
+        if _failed(reached) and bool(reached.result != FitStatus.max_steps_reached) and prior.mean is not None:
             # The start pulls and presses harder than the layer takes: start from what the prior expects.
-            again = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
-            reached = reached if _failed(again) else again
+            run.misfit = misfit
+            reached = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and _failed(reached):

@@ -252,9 +252,13 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
 
 @pytest.mark.slow
 def test_springs_change_nothing_but_the_way(small, monkeypatch):
-    experiment, settings, prior, _ = small
-    thickness = small_map(small)
-    dead = op.fit_traction(experiment, thickness, prior, solver=settings, draws=2, progress=False)
+    # Without friction nothing depends on the way, and both fits have one optimum.
+    experiment, (_, settings, prior, known) = palpation((6, 6, 2), window=0.0, sample=0.0), small
+    thickness = small_map((experiment, settings, prior, known))
+    fit_closely = functools.partial(
+        op.fit_traction, experiment, thickness, prior, solver=settings, rtol=1e-4, draws=2, progress=False
+    )
+    dead = fit_closely()
     # What the fit does where the layer does not carry the estimate that it starts from.
     fit_once = opfem.inverse.fit._Run.fit
 
@@ -263,16 +267,18 @@ def test_springs_change_nothing_but_the_way(small, monkeypatch):
         return reached if run.misfit.bed.stiffness > 0 else reached._replace(result=op.FitStatus.not_carried)
 
     monkeypatch.setattr(opfem.inverse.fit._Run, "fit", not_without_springs)
-    held = op.fit_traction(experiment, thickness, prior, solver=settings, draws=2, progress=False)
+    held = fit_closely()
     assert dead.misfit.bed.stiffness == 0.0
     assert held.misfit.bed.stiffness > 0.0
-    # Friction depends a little on the way to the load.
-    assert jnp.linalg.norm(held.normal - dead.normal) < 0.1 * jnp.linalg.norm(dead.normal_std)
-    assert held.chi2 == pytest.approx(float(dead.chi2), rel=1e-2)
+    assert jnp.linalg.norm(held.normal - dead.normal) < 0.02 * jnp.linalg.norm(dead.normal_std)
+    # A fit ends where what is left of its steps changes all residuals by 0.03 in norm; here there are two fits.
+    assert jnp.sqrt(held.chi2) == pytest.approx(float(jnp.sqrt(dead.chi2)), abs=0.06)
     assert held.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
-    assert held.normal_std == pytest.approx(np.asarray(dead.normal_std), rel=0.05)
+    # Linear systems are solved to 1e-2, which single nodes show and sums hardly do.
+    assert jnp.linalg.norm(held.normal_std) == pytest.approx(float(jnp.linalg.norm(dead.normal_std)), rel=0.03)
     weights = jnp.zeros((7, 7)).at[2:4, 1:4].set(1.0 / 6)
-    assert held.covariance(weights) == pytest.approx(np.asarray(dead.covariance(weights)), rel=0.05, abs=1e-9)
+    variances = [float(jnp.sum(weights * fit.covariance(weights))) for fit in (held, dead)]
+    assert variances[0] == pytest.approx(variances[1], rel=0.02)
 
 
 @pytest.mark.slow
