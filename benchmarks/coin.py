@@ -50,7 +50,7 @@ def run(thickness: op.ThicknessMap, palpation: op.Palpation, settings: op.Newton
     begin = time.perf_counter()
     solution = op.solve(palpation, op.Imprint(thickness, interpolation=interpolation), settings, throw=False)
     jax.block_until_ready(solution.pressure)
-    seconds = time.perf_counter() - begin
+    ready = time.perf_counter()
     stats = {name: np.asarray(value) for name, value in solution.stats.items()}
     total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
     return {
@@ -60,7 +60,8 @@ def run(thickness: op.ThicknessMap, palpation: op.Palpation, settings: op.Newton
         "interpolation": interpolation,
         "face_rule": settings.face_rule,
         "asked_increments": settings.increments,
-        "seconds": round(seconds, 2),
+        "seconds": round(ready - begin, 2),
+        "since_start_s": round(ready - START, 2),
         "message": op.RESULTS[solution.result],
         "load_fraction": float(solution.last_converged.load_fraction),
         "force_N": -float(stats["force_sample"][2]),
@@ -109,7 +110,6 @@ def main() -> None:
                     for c10 in (0.00223, 0.00226) if chosen.again else (0.00223,):
                         palpation = experiment(n, chosen.element, c10, chosen.window_friction, chosen.sample_friction)
                         record = run(thickness, palpation, settings, interpolation, c10=c10)
-                        record["since_start_s"] = round(time.perf_counter() - START, 2)
                         print(json.dumps(record), flush=True)
 
 
