@@ -1,5 +1,6 @@
 """`solve` as users meet it: balances, status, continuation, tracing, determinism, errors."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,6 +92,26 @@ def test_two_runs_give_identical_bits(frictional):
     again = op.solve(palpation(), op.Imprint(bumpy()))
     assert np.array_equal(np.asarray(again.displacement), np.asarray(frictional.displacement))
     assert np.array_equal(np.asarray(again.pressure), np.asarray(frictional.pressure))
+
+
+def test_metres_and_pascals_give_the_same_result():
+    experiment, load, settings = palpation(), op.Imprint(bumpy()), op.Newton(rtol=1e-12)
+    metre, pascal = 1e-3, 1e6  # per mm and MPa; constructors would refuse such numbers
+
+    def lengths(p, imprint):
+        return p.layer.thickness, p.extent, p.sample.law.c0, imprint.thickness.values, imprint.thickness.extent
+
+    def stresses(p, _):
+        material, law = p.layer.material, p.sample.law
+        return material.c10, material.c01, material.bulk, law.p0
+
+    scaled = (experiment, load)
+    for where, unit in ((lengths, metre), (stresses, pascal)):
+        scaled = eqx.tree_at(lambda both, w=where: w(*both), scaled, replace_fn=lambda leaf, u=unit: u * leaf)
+    ours, theirs = op.solve(experiment, load, settings), op.solve(*scaled, settings)
+    for field, unit in (("displacement", metre), ("pressure", pascal), ("traction", pascal)):
+        expected = np.asarray(getattr(ours, field))
+        assert np.linalg.norm(np.asarray(getattr(theirs, field)) / unit - expected) < 1e-10 * np.linalg.norm(expected)
 
 
 def test_jit_equals_eager(frictional):
