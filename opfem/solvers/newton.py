@@ -48,7 +48,7 @@ class Newton(eqx.Module):
         krylov_rtol: Relative tolerance of each linear solve.
         krylov_steps: Most preconditioner applications per linear solve.
         max_backtracks: Halvings of a Newton step that inverts an element, before the increment is cut.
-        step_limit: Furthest move of a node in one Newton step, in element sizes, beyond four
+        step_limit: Furthest move of a node in one Newton step, in mean thicknesses of the layer, beyond four
             times the mean move: a corner that slips over a ridge must not take its neighbours along.
         max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
             solve keeps as many displacement fields. Beyond, derivatives are NaN.
@@ -66,7 +66,7 @@ class Newton(eqx.Module):
     krylov_rtol: float | int | Array = 1e-2
     krylov_steps: float | int | Array = 120
     max_backtracks: float | int | Array = 6
-    step_limit: float | int | Array = 0.1
+    step_limit: float | int | Array = 0.025
     max_increments: int = eqx.field(static=True, default=1500)
     max_path: int = eqx.field(static=True, default=64)
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
@@ -247,5 +247,6 @@ def solve_tangent(
 def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:
     """Shorten the moves of single nodes that stand out of a step."""
     reach = jnp.sqrt(jnp.sum(change**2, axis=0))
-    longest = step_limit * jnp.min(problem.body.cells.element_spacing) + 4.0 * jnp.mean(reach)
+    thickness = problem.elements[0] * problem.body.cells.element_depth
+    longest = step_limit * thickness + 4.0 * jnp.mean(reach)
     return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))
