@@ -208,7 +208,8 @@ def coin_case(path: Path, n: int, model_std: float) -> None:
     """The published coin as measured, and a map of its fit's own traction with errors as large as the fit expects."""
     loaded = op.read_thickness(path, extent=(5.0, 5.0), std=NOISE)
     palpation = experiment((n, n, n // 10), 5.0)
-    prior = op.Matern(length=0.5, std=4e-3, mean=op.uniaxial_estimate(palpation, loaded).mean())
+    # A coin's edges are steps: a prior without a slope.
+    prior = op.Matern(length=0.5, std=4e-3, mean=op.uniaxial_estimate(palpation, loaded).mean(), smoothness=0.5)
     imprint = op.solve(palpation, op.Imprint(loaded.smoothed(fwhm=0.06)))
     # White noise of as much power as one error per element.
     missed = model_std * 160 / n * np.random.default_rng(5).standard_normal((161, 161))

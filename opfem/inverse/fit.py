@@ -33,11 +33,14 @@ from .result import FitError, FitStatus, TractionFit
 from .start import from_estimate, from_normal
 
 Choice = Literal["given", "discrepancy", "evidence"]
-# Relative gradient of each Gauss–Newton system, and most iterations.
+# Relative gradient of each Gauss–Newton system, what is negligible (`PreconditionedDescent`), and most iterations.
 _CG_RTOL = 1e-2
+_CG_NEGLIGIBLE = 0.03
 _CG_STEPS = 60
 # The same with lateral tractions: where the window slips, little holds the layer, and no preconditioner knows it.
 _CG_STEPS_LATERAL = 300
+# Part of a direction below which a fit stalls.
+_LEAST_PART = 5e-3
 # A non-negative pressure bends towards zero below this part of the shear modulus.
 _SOFTNESS = 0.05
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
@@ -181,6 +184,7 @@ class _Run:
             fit_normal(misfit.palpation, misfit.observations, misfit.prior),
             jnp.asarray(_CG_RTOL),
             jnp.asarray(_CG_STEPS if misfit.lateral is None else _CG_STEPS_LATERAL),
+            jnp.asarray(_CG_NEGLIGIBLE),
             jnp.asarray(misfit.hopeless),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
@@ -189,25 +193,29 @@ class _Run:
         for _ in range(self.max_steps):
             white, state, aux, done = _step(gauss_newton, white, misfit, state)
             self.solves += 1
-            loss, inner = float(state.f_info.as_min()), int(state.descent_state.iterations)
-            self.bar.show(self.solves, loss, self.iterations + inner, float(state.descent_state.change))
-            if not bool(jnp.all(aux["followed"])):
-                result = FitStatus.too_many_increments
-                break
-            if not bool(jnp.all(aux["carried"])):
-                result = FitStatus.not_carried
-                break
-            if not np.isfinite(loss) or not all(bool(jnp.all(jnp.isfinite(v))) for v in jax.tree.leaves(state.y_eval)):
-                result = FitStatus.nonfinite
-                break
-            if bool(done):
-                result = FitStatus.successful
+            inner = self.iterations + int(state.descent_state.iterations)
+            self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
+            result = _status(state, aux, done)
+            if result != FitStatus.max_steps_reached:
                 break
         self.iterations += int(state.descent_state.iterations)
         self.steps += int(state.num_accepted_steps)
         J = state.f_info.jac
         posterior = Posterior(white, J, eqx.filter_jit(descent.precondition)(J))
         return _Reached(white, state.f_info.residual, aux, posterior, result)
+
+
+def _status(state: Any, aux: dict[str, Array], done: Array) -> FitStatus:
+    """Tell how a fit has ended; `max_steps_reached` if it has not."""
+    if not jnp.all(aux["followed"]):
+        return FitStatus.too_many_increments
+    if not jnp.all(aux["carried"]):
+        return FitStatus.not_carried
+    if not all(jnp.all(jnp.isfinite(v)) for v in (state.f_info.as_min(), *jax.tree.leaves(state.y_eval))):
+        return FitStatus.nonfinite
+    if done:
+        return FitStatus.successful
+    return FitStatus.stalled if state.search_state.step_size < _LEAST_PART else FitStatus.max_steps_reached
 
 
 def _misfit(white: Unknowns, misfit: Misfit):
@@ -313,17 +321,10 @@ def _result(
             "std_error": 1.0 / (2.0 * draws) ** 0.5,
             "representation_rms": jnp.sqrt(jnp.mean(misfit.observations.representation_rms**2)),
             "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
-            **_informed(misfit, whites),
+            **misfit.informed(whites),
         },
         result=reached.result,
     )
-
-
-def _informed(misfit: Misfit, whites: list[Unknowns]) -> dict[str, Array]:
-    """Tell how much of the variance of a fitted lateral traction the maps took away."""
-    if misfit.lateral is None:
-        return {}
-    return {"lateral_informed": 1.0 - jnp.mean(jnp.stack([white.lateral for white in whites]) ** 2)}
 
 
 def _pressure_deviations(

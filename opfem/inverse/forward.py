@@ -36,7 +36,7 @@ def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = Fa
         palpation: The experiment.
         load: The traction.
         solver: Settings.
-        exact: Derivatives of any order, to 1e-10 (`follow_path`). Else first derivatives to 1e-3, whose products cost
+        exact: Derivatives of any order, to 1e-10 (`follow_path`). Else first derivatives to 1e-4, whose products cost
             little, for least squares (`linearise_path`).
     """
     problem = discretise(palpation, load, None, solver.face_rule)

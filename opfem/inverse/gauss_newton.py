@@ -1,6 +1,8 @@
 """Gauss–Newton steps for optimistix, their linear systems solved by preconditioned conjugate gradients.
 
-Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose.
+Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose. The curvature of
+the residuals, which Gauss–Newton leaves out, is learnt from the steps taken (BFGS on top of the Gauss–Newton matrix):
+where a layer slips and opens, it is several times what Gauss–Newton knows.
 """
 
 from collections.abc import Callable
@@ -12,19 +14,30 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
-# What is left to go, over the posterior's standard deviation along it, below which a direction is not refined [-].
-_NEGLIGIBLE = 0.03
 # A point is accepted where the least of the sum of squares along the way lies beyond this part of it; else the next is
 # that least, but between these parts of the last.
 _BEYOND = 0.6
 _SHORTEST, _LONGEST = 0.1, 0.5
 
 
+# Steps whose curvature is remembered.
+_MEMORY = 20
+
+
 class LeastSquares(NamedTuple):
-    """Solution of a linear least-squares problem, what it leaves of b, its relative gradient, and iterations."""
+    """Solution of a linear least-squares problem.
+
+    Attributes:
+        x: The solution.
+        rest: What it leaves of b.
+        gradient: Jᵀb.
+        relative_gradient: What is left of the right-hand side, in the preconditioner's norm.
+        iterations: How many it took.
+    """
 
     x: PyTree
     rest: PyTree
+    gradient: PyTree
     relative_gradient: Array
     iterations: Array
 
@@ -37,19 +50,19 @@ def least_squares(
     rtol: float | Array,
     most: int | Array,
     negligible: float | Array = 0.0,
-    gradient: PyTree | None = None,
+    further: Callable[[PyTree], PyTree] | None = None,
 ) -> LeastSquares:
-    """Minimise |J x - b|² / 2 - gradient · x by conjugate gradients on the normal equations.
+    """Minimise |J x - b|² / 2 - further(Jᵀb) · x by conjugate gradients on the normal equations.
 
     Args:
         jacobian: Multiply with J.
         transpose: Multiply with its transpose.
         precondition: Approximate inverse of JᵀJ, symmetric positive; only nearly linear is enough.
         b: What J x is to match.
-        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + gradient, in the preconditioner's norm.
+        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + further(Jᵀb), in the preconditioner's norm.
         most: Most iterations.
         negligible: Enough is also a gradient of this norm: the length of what is left to go, measured by J.
-        gradient: What to add to the right-hand side Jᵀb; None: nothing.
+        further: What to add to the right-hand side Jᵀb, made from it; None: nothing.
 
     Source:
         Björck, Numerical Methods for Least Squares Problems, algorithm 7.4.1 (CGLS), preconditioned;
@@ -65,22 +78,25 @@ def least_squares(
 
     # The first pass only finds the gradient: so each product appears, and is compiled, once.
     def iterate(carry):
-        x, rest, before, p, size, first, count = carry
+        x, rest, pulled, added, before, p, size, first, count = carry
         q = jacobian(p)
         squared = dot(q, q)
         step = jnp.where(squared > 0, size / jnp.where(squared > 0, squared, 1.0), 0.0)
         x, rest = plus(x, p, step), plus(rest, q, -step)
         now = transpose(rest)
-        now = now if gradient is None else plus(now, gradient)
+        pulled = jax.tree.map(lambda new, old: jnp.where(count == 0, new, old), now, pulled)
+        if further is not None:
+            added = jax.lax.cond(count == 0, lambda: further(pulled), lambda: added)
+            now = plus(now, added)
         z = precondition(now)
         new = dot(now, z)
         change = new - dot(before, z)
         p = plus(z, p, jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0))
-        return x, rest, now, p, new, jnp.where(count == 0, new, first), count + 1
+        return x, rest, pulled, added, now, p, new, jnp.where(count == 0, new, first), count + 1
 
-    start = (zeros, b, zeros, zeros, zero, zero, none)
-    x, rest, *_, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
-    return LeastSquares(x, rest, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1)
+    start = (zeros, b, zeros, zeros, zeros, zeros, zero, zero, none)
+    x, rest, pulled, *_, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
+    return LeastSquares(x, rest, pulled, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1)
 
 
 def dot(a: PyTree, b: PyTree) -> Array:
@@ -93,10 +109,55 @@ def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:
     return jax.tree.map(lambda v, w: v + factor * w, a, b)
 
 
+class Secants(NamedTuple):
+    """Steps taken and what they changed the gradient by, newest last; zero where there is none yet."""
+
+    step: PyTree
+    change: PyTree
+
+    def followed_by(self, step: PyTree, change: PyTree) -> "Secants":
+        """Remember one more, if the gradient rose along it, and forget the oldest."""
+        rises = dot(step, change) > 0
+
+        def append(stack, new):
+            return jnp.where(rises, jnp.concatenate([stack[1:], new[None]]), stack)
+
+        return Secants(*(jax.tree.map(append, *pair) for pair in zip(self, (step, change), strict=True)))
+
+    def before(self, gradient: PyTree) -> tuple[PyTree, Array]:
+        """Turn a gradient into the right-hand side for the matrix that secants correct; also return what `after` needs.
+
+        Source:
+            Nocedal and Wright, Numerical Optimization, algorithm 7.4 (two-loop recursion).
+        """
+
+        def one(q, secant):
+            along = secant._weight() * dot(secant.step, q)
+            return plus(q, secant.change, -along), along
+
+        return jax.lax.scan(one, gradient, self, reverse=True)
+
+    def after(self, x: PyTree, along: Array) -> PyTree:
+        """Turn the solution with that matrix into the direction."""
+
+        def one(x, each):
+            secant, along = each
+            return plus(x, secant.step, along - secant._weight() * dot(secant.change, x)), None
+
+        return jax.lax.scan(one, x, (self, along))[0]
+
+    def _weight(self) -> Array:
+        curvature = dot(self.step, self.change)
+        return jnp.where(curvature > 0, 1.0 / jnp.where(curvature > 0, curvature, 1.0), 0.0)
+
+
 class _Direction(eqx.Module):
     newton: Any
     change: Array  # that it makes to the residuals, over their norm
     iterations: Array  # of all systems so far
+    point: Any
+    gradient: Any
+    secants: Secants
     result: optx.RESULTS
 
 
@@ -107,29 +168,41 @@ class PreconditionedDescent(optx.AbstractDescent):
         precondition: Makes, from J, an approximate inverse of JᵀJ.
         rtol: Relative tolerance of each linear system.
         most: Most iterations of each.
+        negligible: What is left to go, over the posterior's standard deviation along it, below which a direction is
+            not refined [-].
         hopeless: Half sum of squares from which on no direction is looked for.
     """
 
     precondition: Callable[[Any], Callable[[PyTree], PyTree]]
     rtol: Array
     most: Array
+    negligible: Array
     hopeless: Array
 
     def init(self, y, f_info_struct):
         """Start without a direction."""
         del f_info_struct
-        return _Direction(y, jnp.full((), jnp.inf), jnp.zeros((), int), optx.RESULTS.successful)
+        none = jax.tree.map(lambda v: jnp.zeros((_MEMORY, *v.shape), v.dtype), y)
+        secants = Secants(none, none)
+        return _Direction(y, jnp.full((), jnp.inf), jnp.zeros((), int), y, y, secants, optx.RESULTS.successful)
 
     def query(self, y, f_info, state):
         """Solve for the direction at an accepted point."""
-        del y
-        J = f_info.jac
-        residual = f_info.residual
+        J, residual = f_info.jac, f_info.residual
         most = jnp.where(f_info.as_min() < self.hopeless, self.most, 0)
-        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, _NEGLIGIBLE)
-        change = plus(residual, solved.rest, -1.0)
-        relative = jnp.sqrt(dot(change, change) / dot(residual, residual))
-        return _Direction(solved.x, relative, state.iterations + solved.iterations, optx.RESULTS.successful)
+
+        def secants(gradient):
+            return state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
+
+        def further(gradient):
+            return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
+
+        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, self.negligible, further)
+        gradient, known = solved.gradient, secants(solved.gradient)
+        newton = known.after(solved.x, known.before(gradient)[1])
+        relative = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
+        iterations = state.iterations + solved.iterations
+        return _Direction(newton, relative, iterations, y, gradient, known, optx.RESULTS.successful)
 
     def step(self, step_size, state):
         """Go a part of the way."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .gauss_newton import LeastSquares, least_squares, plus
 
-# Relative gradient of each draw's linear system, and most iterations.
+# Relative gradient of each linear system, and most iterations.
 _RTOL = 1e-2
 _STEPS = 200
 
@@ -22,32 +22,36 @@ class Posterior(eqx.Module):
         white: The optimum.
         jacobian: Of all standardised residuals, those of the prior included, by white unknowns.
         precondition: Approximate inverse of its normal matrix.
+        rtol: Relative gradient of the linear system of each draw or product.
     """
 
     white: PyTree
     jacobian: lx.AbstractLinearOperator
     precondition: Callable[[PyTree], PyTree]
+    rtol: float | Array = _RTOL
 
-    def solve(self, residual: PyTree, gradient: PyTree | None = None, rtol: float | Array = _RTOL) -> LeastSquares:
+    def solve(self, residual: PyTree, gradient: PyTree | None = None) -> LeastSquares:
         """Find the change of the unknowns that makes residuals change as asked, as nearly as possible.
 
         Args:
             residual: Change asked of each residual.
             gradient: What to add to the right-hand side of the normal equations; None: nothing.
-            rtol: Relative tolerance of the gradient.
+
+        Returns:
+            The solution; NaN where the iteration diverged.
         """
         if gradient is None:
             gradient = jax.tree.map(jnp.zeros_like, self.white)
-        return _solve(self, residual, gradient, jnp.asarray(rtol))
+        return _solve(self, residual, gradient)
 
     def residual_structure(self) -> PyTree:
         """Return shapes and types of the residuals."""
         return self.jacobian.out_structure()
 
-    def covariance(self, weights: PyTree, rtol: float = _RTOL) -> PyTree:
+    def covariance(self, weights: PyTree) -> PyTree:
         """Multiply the posterior covariance of the white unknowns with weights."""
         nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), self.residual_structure())
-        return self.solve(nothing, weights, rtol).x
+        return self.solve(nothing, weights).x
 
     def draw(self, key: PRNGKeyArray) -> tuple[PyTree, PyTree, Array]:
         """Draw a deviation from the optimum.
@@ -69,6 +73,10 @@ class Posterior(eqx.Module):
 
 # One compiled program for all that a posterior is asked: products with the Jacobian are large.
 @eqx.filter_jit
-def _solve(posterior: Posterior, residual: PyTree, gradient: PyTree, rtol: Array) -> LeastSquares:
+def _solve(posterior: Posterior, residual: PyTree, gradient: PyTree) -> LeastSquares:
     J = posterior.jacobian
-    return least_squares(J.mv, J.T.mv, posterior.precondition, residual, rtol, _STEPS, gradient=gradient)
+    precondition, rtol = posterior.precondition, posterior.rtol
+    solved = least_squares(J.mv, J.T.mv, precondition, residual, rtol, _STEPS, further=lambda _: gradient)
+    # Products that are not exact enough make the iteration diverge.
+    good = solved.relative_gradient <= 1.0
+    return jax.tree.map(lambda v: jnp.where(good, v, jnp.nan) if eqx.is_inexact_array(v) else v, solved)

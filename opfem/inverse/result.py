@@ -33,6 +33,10 @@ class FitStatus(eqx.Enumeration):
         "from the normal traction of a fit on a coarser mesh (start=...), a prior with a mean, a longer length or a "
         "smaller std."
     )
+    stalled = (
+        "Hardly any step along the directions of the fit lowers its misfit, as where the layer snaps under its "
+        "traction. Start closer (start=...), or give the prior a mean, a longer length or a smaller std."
+    )
     not_carried = (
         "The layer does not carry the traction that the fit starts from. Give the prior a smaller std or a longer "
         "length; where the sample does not touch, mask the map, or keep the layer from being pulled off its window by "

@@ -255,9 +255,12 @@ def test_springs_change_nothing_but_the_way(small, monkeypatch):
     # Without friction nothing depends on the way, and both fits have one optimum.
     experiment, (_, settings, prior, known) = palpation((6, 6, 2), window=0.0, sample=0.0), small
     thickness = small_map((experiment, settings, prior, known))
-    fit_closely = functools.partial(
-        op.fit_traction, experiment, thickness, prior, solver=settings, rtol=1e-4, draws=2, progress=False
-    )
+    monkeypatch.setattr(opfem.inverse.fit, "_CG_NEGLIGIBLE", 3e-3)
+
+    def fit_closely():
+        fit = op.fit_traction(experiment, thickness, prior, solver=settings, rtol=1e-3, draws=2, progress=False)
+        return eqx.tree_at(lambda f: f.posterior.rtol, fit, 3e-3)
+
     dead = fit_closely()
     # What the fit does where the layer does not carry the estimate that it starts from.
     fit_once = opfem.inverse.fit._Run.fit
@@ -270,15 +273,15 @@ def test_springs_change_nothing_but_the_way(small, monkeypatch):
     held = fit_closely()
     assert dead.misfit.bed.stiffness == 0.0
     assert held.misfit.bed.stiffness > 0.0
-    assert jnp.linalg.norm(held.normal - dead.normal) < 0.02 * jnp.linalg.norm(dead.normal_std)
-    # A fit ends where what is left of its steps changes all residuals by 0.03 in norm; here there are two fits.
-    assert jnp.sqrt(held.chi2) == pytest.approx(float(jnp.sqrt(dead.chi2)), abs=0.06)
+    scale = float(jnp.max(dead.normal_std))
+    assert held.normal == pytest.approx(np.asarray(dead.normal), abs=0.02 * scale)
+    assert held.chi2 == pytest.approx(float(dead.chi2), rel=0.01)
     assert held.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
-    # Linear systems are solved to 1e-2, which single nodes show and sums hardly do.
-    assert jnp.linalg.norm(held.normal_std) == pytest.approx(float(jnp.linalg.norm(dead.normal_std)), rel=0.03)
+    deviations, others = (fit.draws(jax.random.key(0), 4) - fit.normal for fit in (held, dead))
+    assert deviations == pytest.approx(np.asarray(others), abs=0.05 * scale)
     weights = jnp.zeros((7, 7)).at[2:4, 1:4].set(1.0 / 6)
-    variances = [float(jnp.sum(weights * fit.covariance(weights))) for fit in (held, dead)]
-    assert variances[0] == pytest.approx(variances[1], rel=0.02)
+    covariance, other = (fit.covariance(weights) for fit in (held, dead))
+    assert covariance == pytest.approx(np.asarray(other), abs=0.05 * float(jnp.max(jnp.abs(other))))
 
 
 @pytest.mark.slow

@@ -72,6 +72,7 @@ def test_least_squares_against_numpy():
     A, b = jnp.asarray(rng.standard_normal((30, 12))), jnp.asarray(rng.standard_normal(30))
     solved = least_squares(lambda x: A @ x, lambda r: A.T @ r, lambda g: g / jnp.sum(A**2, axis=0), b, 1e-12, 100)
     assert solved.x == pytest.approx(np.linalg.lstsq(np.asarray(A), np.asarray(b))[0], abs=1e-10)
+    assert solved.gradient == pytest.approx(np.asarray(A.T @ b))
     assert solved.relative_gradient <= 1e-12
     assert 0 < solved.iterations <= 30
 
