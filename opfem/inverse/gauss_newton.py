@@ -18,8 +18,6 @@ from jaxtyping import Array, PyTree
 # that least, but between these parts of the last.
 _BEYOND = 0.6
 _SHORTEST, _LONGEST = 0.1, 0.5
-
-
 # Steps whose curvature is remembered.
 _MEMORY = 20
 

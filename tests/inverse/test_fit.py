@@ -275,13 +275,16 @@ def test_springs_change_nothing_but_the_way(small, monkeypatch):
     assert held.misfit.bed.stiffness > 0.0
     scale = float(jnp.max(dead.normal_std))
     assert held.normal == pytest.approx(np.asarray(dead.normal), abs=0.02 * scale)
+    assert jnp.linalg.norm(held.normal - dead.normal) < 0.02 * jnp.linalg.norm(dead.normal_std)
     assert held.chi2 == pytest.approx(float(dead.chi2), rel=0.01)
     assert held.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
+    assert jnp.linalg.norm(held.normal_std) == pytest.approx(float(jnp.linalg.norm(dead.normal_std)), rel=0.03)
     deviations, others = (fit.draws(jax.random.key(0), 4) - fit.normal for fit in (held, dead))
     assert deviations == pytest.approx(np.asarray(others), abs=0.05 * scale)
     weights = jnp.zeros((7, 7)).at[2:4, 1:4].set(1.0 / 6)
     covariance, other = (fit.covariance(weights) for fit in (held, dead))
     assert covariance == pytest.approx(np.asarray(other), abs=0.05 * float(jnp.max(jnp.abs(other))))
+    assert jnp.sum(weights * covariance) == pytest.approx(float(jnp.sum(weights * other)), rel=0.02)
 
 
 @pytest.mark.slow
