@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from .._checks import concrete
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
-from ..model import Contact, Palpation
+from ..model import Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
@@ -22,12 +21,11 @@ from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, PreconditionedDescent
 from .hyperparameters import most_likely, rescaled
 from .misfit import Misfit, carried, moved, pressure_change
-from .noise import noise_std
 from .observation import observe
-from .parameters import AbstractNumberPrior, check_parameters
-from .posterior import Posterior
+from .parameters import AbstractNumberPrior
+from .posterior import MOST_ITERATIONS, Posterior
 from .preconditioner import Unknowns, fit_normal
-from .prior import AbstractPrior, Matern, on_nodes
+from .prior import AbstractPrior, on_nodes
 from .resolution import resolution
 from .result import FitError, FitStatus, TractionFit
 from .start import from_estimate, from_normal
@@ -116,19 +114,19 @@ def fit_traction(
     """
     require_float64(palpation)
     parameters = dict(parameters or {})
-    maps = _as_tuple(thickness)
-    _check(palpation, maps, prior, lateral, parameters)
+    maps = as_tuple(thickness)
+    check_inputs(palpation, maps, prior, lateral, parameters)
     several = not isinstance(thickness, ThicknessMap)
-    observations = _observe(palpation.mesh(), *_stacked_maps(maps), jnp.asarray(model_std, float))
-    _check_covered(maps, observations)
+    observations = _observe(palpation.mesh(), *stacked_maps(maps), jnp.asarray(model_std, float))
+    check_covered(maps, observations)
     misfit = Misfit(
         palpation=palpation,
         observations=observations,
         prior=prior,
         lateral=lateral,
         parameters=parameters,
-        forces=_stacked("forces", forces, len(maps)),
-        inside=_stacked("inside", inside, len(maps)),
+        forces=stacked("forces", forces, len(maps)),
+        inside=stacked("inside", inside, len(maps)),
         softness=_SOFTNESS * palpation.layer.material.shear if nonnegative else None,
         bed=no_bed(palpation, observations, prior),
         solver=solver.as_leaves(),
@@ -153,6 +151,12 @@ def fit_traction(
         fit = _result(reached, run, several, draws, key, bar)
     if bool(fit.result == FitStatus.successful) and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
+    if cut_short := fit.stats["draws_cut_short"]:
+        warnings.warn(
+            f"{cut_short} of {draws} draws were cut short after {MOST_ITERATIONS} iterations: standard deviations and "
+            "degrees of freedom are rough. Give the prior a smaller std or a longer length.",
+            stacklevel=2,
+        )
     return fit
 
 
@@ -279,7 +283,7 @@ def _result(
         solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
         for i in range(loads.normal.shape[0])
     ]
-    deviations, moves, whites, dof, iterations = [], [], [], [], 0
+    deviations, moves, whites, dof, iterations, cut_short = [], [], [], [], 0, 0
     for count, one in enumerate(jax.random.split(key, draws)):
         white, normal, move, determined, steps = _draw(reached.posterior, one)
         deviations.append(normal)
@@ -287,6 +291,7 @@ def _result(
         whites.append(white)
         dof.append(determined)
         iterations += int(steps)
+        cut_short += int(steps) >= MOST_ITERATIONS
         bar.drawn(count + 1, draws)
     deviations = jnp.stack(deviations)
     pressures = _pressure_deviations(palpation, solutions, deviations, jnp.stack(moves))
@@ -318,6 +323,7 @@ def _result(
             "inner_iterations": run.iterations,
             "posterior_iterations": iterations,
             "draws": draws,
+            "draws_cut_short": cut_short,
             "std_error": 1.0 / (2.0 * draws) ** 0.5,
             "representation_rms": jnp.sqrt(jnp.mean(misfit.observations.representation_rms**2)),
             "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
@@ -346,72 +352,3 @@ def _pressure_deviations(
 
 def _rms(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:
     return jnp.sqrt(jnp.mean(deviations**2, axis=0))
-
-
-def _as_tuple(value: Any) -> tuple:
-    return tuple(value) if isinstance(value, Sequence) else (value,)
-
-
-def _stacked(name: str, value: Any, maps: int) -> Any:
-    """Stack what is given for each map."""
-    if value is None:
-        return None
-    each = _as_tuple(value)
-    if len(each) != maps:
-        raise ValueError(f"fit_traction.{name} needs one for each of {maps} maps, got {len(each)}.")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-
-
-def _stacked_maps(maps: tuple[ThicknessMap, ...]) -> tuple[ThicknessMap, Array]:
-    """Stack maps, and their noise."""
-    plain = [ThicknessMap(m.values, m.extent, None, m.origin, None, m.mask, noise_length=m.noise_length) for m in maps]
-    std = [jnp.broadcast_to(noise_std("fit_traction", m), m.shape) for m in maps]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain), jnp.stack(std)
-
-
-def _check(
-    palpation: Palpation, maps: tuple[ThicknessMap, ...], prior: Any, lateral: Any, parameters: Mapping[str, Any]
-) -> None:
-    if not isinstance(palpation.sample, Contact):
-        raise ValueError(
-            f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
-        )
-    if palpation.element in ("tet4", "tet10"):
-        raise ValueError(f"fit_traction needs hexahedra, such as element='mean_dilatation', got {palpation.element!r}.")
-    for m in maps:
-        noise_std("fit_traction", m)
-    if not maps or len({m.shape for m in maps}) > 1:
-        raise ValueError(
-            f"fit_traction.thickness must be one map, or several on one grid of pixels, got shapes "
-            f"{[m.shape for m in maps]}."
-        )
-    check_parameters(palpation, parameters)
-    nx, ny, _ = palpation.elements
-    if min(nx, ny) < 4:
-        raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
-    for name, one in (("prior", prior), ("lateral", lateral)):
-        if one is None and name == "lateral":
-            continue
-        if not isinstance(one, AbstractPrior):
-            raise ValueError(
-                f"fit_traction.{name} must be Matern(...), Tikhonov(...) or TotalVariation(...), got "
-                f"{type(one).__name__}."
-            )
-        length = concrete(one.length) if isinstance(one, Matern) else None
-        size = concrete(jnp.stack(palpation.mesh().spacing).max())
-        if length is not None and size is not None and np.any(length < size):
-            raise ValueError(
-                f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh "
-                "cannot follow it. Pass a longer length, or Palpation(elements=...) with more."
-            )
-
-
-def _check_covered(maps: tuple[ThicknessMap, ...], observations: Any) -> None:
-    for number, (m, informed) in enumerate(zip(maps, np.asarray(observations.informed), strict=True)):
-        if informed == 0:
-            raise ValueError(
-                f"fit_traction: map {number} has no pixel with data on the layer, which covers 0 to its extent [mm]; "
-                f"the map starts at (x, y) = {np.asarray(m.origin).tolist()} and ends at "
-                f"{np.asarray(m.origin + m.extent).tolist()} mm, {float(np.mean(m.mask)):.0%} of it masked. "
-                "Pass ThicknessMap(origin=...) that matches, or unmask pixels."
-            )

@@ -215,8 +215,9 @@ class _Search(eqx.Module):
 class Interpolating(optx.AbstractSearch):
     """Whole steps; where the sum of squares falls by much less than the Jacobian says, back to its least.
 
-    A direction costs tens of products, a look along it one solve. What the Jacobian says comes with the direction:
-    unlike in `optimistix.BacktrackingArmijo`, it is not multiplied with once more.
+    The next direction is first looked along as far as the least of the last one lay. A direction costs tens of
+    products, a look along it one solve. What the Jacobian says comes with the direction: unlike in
+    `optimistix.BacktrackingArmijo`, it is not multiplied with once more.
     """
 
     def init(self, y, f_info_struct):
@@ -232,7 +233,8 @@ class Interpolating(optx.AbstractSearch):
         curvature = (now - before + 2.0 * fall * length) / length**2
         least = jnp.where(jnp.isfinite(now), fall / jnp.where(curvature > 0, curvature, fall), 0.0)
         accept = first_step | ((now <= before) & (least >= _BEYOND * length))
-        length = jnp.where(accept, 1.0, jnp.clip(least, _SHORTEST * length, _LONGEST * length))
+        shorter = jnp.clip(least, _SHORTEST * length, _LONGEST * length)
+        length = jnp.where(accept, jnp.where(first_step, 1.0, jnp.minimum(least, 1.0)), shorter)
         return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .gauss_newton import LeastSquares, least_squares, plus
 
-# Relative gradient of each linear system, and most iterations.
+# Most iterations of each linear system, and the relative gradient that it is solved to.
+MOST_ITERATIONS = 200
 _RTOL = 1e-2
-_STEPS = 200
 
 
 class Posterior(eqx.Module):
@@ -59,8 +59,9 @@ class Posterior(eqx.Module):
         Least squares against white noise in every residual has exactly the posterior's covariance.
 
         Returns:
-            The deviation of the white unknowns; of the residuals; iterations. The sum of squares of a part of the
-            residuals, averaged over draws, is the number of degrees of freedom that they determine.
+            The deviation of the white unknowns; of the residuals; iterations, `MOST_ITERATIONS` where they were cut
+            short. The sum of squares of a part of the residuals, averaged over draws, is the number of degrees of
+            freedom that they determine.
         """
         leaves, tree = jax.tree.flatten(self.residual_structure())
         keys = jax.random.split(key, len(leaves))
@@ -76,7 +77,7 @@ class Posterior(eqx.Module):
 def _solve(posterior: Posterior, residual: PyTree, gradient: PyTree) -> LeastSquares:
     J = posterior.jacobian
     precondition, rtol = posterior.precondition, posterior.rtol
-    solved = least_squares(J.mv, J.T.mv, precondition, residual, rtol, _STEPS, further=lambda _: gradient)
+    solved = least_squares(J.mv, J.T.mv, precondition, residual, rtol, MOST_ITERATIONS, further=lambda _: gradient)
     # Products that are not exact enough make the iteration diverge.
     good = solved.relative_gradient <= 1.0
     return jax.tree.map(lambda v: jnp.where(good, v, jnp.nan) if eqx.is_inexact_array(v) else v, solved)

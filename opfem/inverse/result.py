@@ -76,10 +76,10 @@ class TractionFit(eqx.Module):
         misfit: What was minimised, with the prior as chosen.
         posterior: The posterior of the white unknowns.
         stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (each one product with the Jacobian and one
-            with its transpose), `posterior_iterations`, `draws`, `std_error` (relative standard error of the standard
-            deviations [-]), `representation_rms` [mm] (what the map has beyond mesh-spaced splines),
-            `misfit_rms` [mm]; `lateral_informed` [-] where the lateral traction was fitted: 0 where it rests on its
-            prior alone, 1 where on the maps.
+            with its transpose), `posterior_iterations`, `draws`, `draws_cut_short` (those whose linear system was
+            not solved), `std_error` (relative standard error of the standard deviations [-]), `representation_rms`
+            [mm] (what the map has beyond mesh-spaced splines), `misfit_rms` [mm]; `lateral_informed` [-] where the
+            lateral traction was fitted: 0 where it rests on its prior alone, 1 where on the maps.
         result: How the fit ended.
     """
 

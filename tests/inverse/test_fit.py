@@ -13,6 +13,7 @@ import pytest
 import opfem as op
 import opfem.inverse.fit
 from opfem.inverse.forward import press
+from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
 from opfem.inverse.observation import _spline_values, interface_heights
 from opfem.inverse.start import on_mesh
 from opfem.mechanics.face import tributary_area
@@ -365,6 +366,27 @@ def test_path_that_is_too_short_is_named(small):
     experiment, _, prior, _ = small
     with pytest.raises(op.FitError, match="Raise max_path"):
         op.fit_traction(experiment, small_map(small), prior, solver=op.Newton(increments=3, max_path=2), progress=False)
+
+
+def test_fit_stalls_where_no_step_along_its_direction_helps():
+    def beyond_a_ridge(y, _):
+        aux = {"followed": jnp.ones((), bool), "carried": jnp.ones((), bool)}
+        return y - 10.0 + jnp.where(y > 1e-3, 1e3, 0.0), aux
+
+    rtol, number = jnp.asarray(1e-2), jnp.asarray
+    descent = PreconditionedDescent(lambda J: lambda g: g, rtol, number(60), number(0.03), number(jnp.inf))
+    solver = GaussNewton(rtol, rtol, descent)
+    state = solver.init(
+        beyond_a_ridge, y := jnp.zeros(3), None, {}, *jax.eval_shape(beyond_a_ridge, y, None), frozenset()
+    )
+    for _ in range(6):
+        y, state, aux = solver.step(beyond_a_ridge, y, None, {}, state, frozenset())
+        done, _ = solver.terminate(beyond_a_ridge, y, None, {}, state, frozenset())
+        status = opfem.inverse.fit._status(state, aux, done)
+        if status != op.FitStatus.max_steps_reached:
+            break
+    assert status == op.FitStatus.stalled
+    assert jnp.all(y == 0.0)
 
 
 @pytest.mark.slow

@@ -1,0 +1,89 @@
+"""What a fit is given: checked, and stacked over maps."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._checks import concrete
+from ..measurement import ThicknessMap
+from ..model import Contact, Palpation
+from .noise import noise_std
+from .observation import Observation
+from .parameters import check_parameters
+from .prior import AbstractPrior, Matern
+
+
+def as_tuple(value: Any) -> tuple:
+    """Make one thing a sequence of one."""
+    return tuple(value) if isinstance(value, Sequence) else (value,)
+
+
+def stacked(name: str, value: Any, maps: int) -> Any:
+    """Stack what is given for each map."""
+    if value is None:
+        return None
+    each = as_tuple(value)
+    if len(each) != maps:
+        raise ValueError(f"fit_traction.{name} needs one for each of {maps} maps, got {len(each)}.")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def stacked_maps(maps: tuple[ThicknessMap, ...]) -> tuple[ThicknessMap, Array]:
+    """Stack maps, and their noise."""
+    plain = [ThicknessMap(m.values, m.extent, None, m.origin, None, m.mask, noise_length=m.noise_length) for m in maps]
+    std = [jnp.broadcast_to(noise_std("fit_traction", m), m.shape) for m in maps]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain), jnp.stack(std)
+
+
+def check_inputs(
+    palpation: Palpation, maps: tuple[ThicknessMap, ...], prior: Any, lateral: Any, parameters: Mapping[str, Any]
+) -> None:
+    """Refuse what a fit cannot work with."""
+    if not isinstance(palpation.sample, Contact):
+        raise ValueError(
+            f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
+        )
+    if palpation.element in ("tet4", "tet10"):
+        raise ValueError(f"fit_traction needs hexahedra, such as element='mean_dilatation', got {palpation.element!r}.")
+    for m in maps:
+        noise_std("fit_traction", m)
+    if not maps or len({m.shape for m in maps}) > 1:
+        raise ValueError(
+            f"fit_traction.thickness must be one map, or several on one grid of pixels, got shapes "
+            f"{[m.shape for m in maps]}."
+        )
+    check_parameters(palpation, parameters)
+    nx, ny, _ = palpation.elements
+    if min(nx, ny) < 4:
+        raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
+    for name, one in (("prior", prior), ("lateral", lateral)):
+        if one is None and name == "lateral":
+            continue
+        if not isinstance(one, AbstractPrior):
+            raise ValueError(
+                f"fit_traction.{name} must be Matern(...), Tikhonov(...) or TotalVariation(...), got "
+                f"{type(one).__name__}."
+            )
+        length = concrete(one.length) if isinstance(one, Matern) else None
+        size = concrete(jnp.stack(palpation.mesh().spacing).max())
+        if length is not None and size is not None and np.any(length < size):
+            raise ValueError(
+                f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh "
+                "cannot follow it. Pass a longer length, or Palpation(elements=...) with more."
+            )
+
+
+def check_covered(maps: tuple[ThicknessMap, ...], observations: Observation) -> None:
+    """Refuse a map that says nothing of the layer."""
+    for number, (m, informed) in enumerate(zip(maps, np.asarray(observations.informed), strict=True)):
+        if informed == 0:
+            raise ValueError(
+                f"fit_traction: map {number} has no pixel with data on the layer, which covers 0 to its extent [mm]; "
+                f"the map starts at (x, y) = {np.asarray(m.origin).tolist()} and ends at "
+                f"{np.asarray(m.origin + m.extent).tolist()} mm, {float(np.mean(m.mask)):.0%} of it masked. "
+                "Pass ThicknessMap(origin=...) that matches, or unmask pixels."
+            )
