@@ -18,8 +18,9 @@ from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .bed import lay_bed, no_bed
 from .data import AxialDisplacement, ForceReading
-from .gauss_newton import GaussNewton, PreconditionedDescent
+from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
 from .hyperparameters import most_likely, rescaled
+from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
 from .misfit import Misfit, carried, moved, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
@@ -205,7 +206,8 @@ class _Run:
         self.iterations += int(state.descent_state.iterations)
         self.steps += int(state.num_accepted_steps)
         J = state.f_info.jac
-        posterior = Posterior(white, J, eqx.filter_jit(descent.precondition)(J))
+        inverse = Learnt(eqx.filter_jit(descent.precondition)(J), state.descent_state.iterated)
+        posterior = Posterior(white, J, inverse)
         return _Reached(white, state.f_info.residual, aux, posterior, result)
 
 

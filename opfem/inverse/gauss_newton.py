@@ -1,6 +1,7 @@
 """Gauss–Newton steps for optimistix, their linear systems solved by preconditioned conjugate gradients.
 
-Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose. The curvature of
+Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose. What iterations
+find out of the Gauss–Newton matrix preconditions the next system (BFGS on top of the preconditioner). The curvature of
 the residuals, which Gauss–Newton leaves out, is learnt from the steps taken (BFGS on top of the Gauss–Newton matrix):
 where a layer slips and opens, it is several times what Gauss–Newton knows.
 """
@@ -18,8 +19,9 @@ from jaxtyping import Array, PyTree
 # that least, but between these parts of the last.
 _BEYOND = 0.6
 _SHORTEST, _LONGEST = 0.1, 0.5
-# Steps whose curvature is remembered.
+# Steps whose curvature is remembered, and iterations of linear systems.
 _MEMORY = 20
+_MEMORY_OF_ITERATIONS = 60
 
 
 class LeastSquares(NamedTuple):
@@ -31,6 +33,7 @@ class LeastSquares(NamedTuple):
         gradient: Jᵀb.
         relative_gradient: What is left of the right-hand side, in the preconditioner's norm.
         iterations: How many it took.
+        secants: What was known of JᵀJ, and what these iterations found.
     """
 
     x: PyTree
@@ -38,6 +41,7 @@ class LeastSquares(NamedTuple):
     gradient: PyTree
     relative_gradient: Array
     iterations: Array
+    secants: "Secants | None"
 
 
 def least_squares(
@@ -49,6 +53,7 @@ def least_squares(
     most: int | Array,
     negligible: float | Array = 0.0,
     further: Callable[[PyTree], PyTree] | None = None,
+    secants: "Secants | None" = None,
 ) -> LeastSquares:
     """Minimise |J x - b|² / 2 - further(Jᵀb) · x by conjugate gradients on the normal equations.
 
@@ -61,10 +66,12 @@ def least_squares(
         most: Most iterations.
         negligible: Enough is also a gradient of this norm: the length of what is left to go, measured by J.
         further: What to add to the right-hand side Jᵀb, made from it; None: nothing.
+        secants: What is known of JᵀJ, to correct the preconditioner with; None: nothing, and nothing is learnt.
 
     Source:
         Björck, Numerical Methods for Least Squares Problems, algorithm 7.4.1 (CGLS), preconditioned;
-        Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear.
+        Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear;
+        Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 for one that learns from the last system.
     """
     like = jax.eval_shape(transpose, b)
     zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
@@ -76,7 +83,7 @@ def least_squares(
 
     # The first pass only finds the gradient: so each product appears, and is compiled, once.
     def iterate(carry):
-        x, rest, pulled, added, before, p, size, first, count = carry
+        x, rest, pulled, added, before, p, found, size, first, count = carry
         q = jacobian(p)
         squared = dot(q, q)
         step = jnp.where(squared > 0, size / jnp.where(squared > 0, squared, 1.0), 0.0)
@@ -86,15 +93,19 @@ def least_squares(
         if further is not None:
             added = jax.lax.cond(count == 0, lambda: further(pulled), lambda: added)
             now = plus(now, added)
-        z = precondition(now)
+        if secants is None:
+            z = precondition(now)
+        else:
+            z = secants.corrected(precondition, now)
+            found = found.followed_by(jax.tree.map(lambda v: step * v, p), plus(before, now, -1.0))
         new = dot(now, z)
         change = new - dot(before, z)
         p = plus(z, p, jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0))
-        return x, rest, pulled, added, now, p, new, jnp.where(count == 0, new, first), count + 1
+        return x, rest, pulled, added, now, p, found, new, jnp.where(count == 0, new, first), count + 1
 
-    start = (zeros, b, zeros, zeros, zeros, zeros, zero, zero, none)
-    x, rest, pulled, *_, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
-    return LeastSquares(x, rest, pulled, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1)
+    start = (zeros, b, zeros, zeros, zeros, zeros, secants, zero, zero, none)
+    x, rest, pulled, *_, found, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
+    return LeastSquares(x, rest, pulled, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1, found)
 
 
 def dot(a: PyTree, b: PyTree) -> Array:
@@ -112,6 +123,12 @@ class Secants(NamedTuple):
 
     step: PyTree
     change: PyTree
+
+    @classmethod
+    def none(cls, like: PyTree, memory: int) -> "Secants":
+        """Remember nothing yet."""
+        zeros = jax.tree.map(lambda v: jnp.zeros((memory, *v.shape), v.dtype), like)
+        return cls(zeros, zeros)
 
     def followed_by(self, step: PyTree, change: PyTree) -> "Secants":
         """Remember one more, if the gradient rose along it, and forget the oldest."""
@@ -144,9 +161,25 @@ class Secants(NamedTuple):
 
         return jax.lax.scan(one, x, (self, along))[0]
 
+    def corrected(self, inverse: Callable[[PyTree], PyTree], gradient: PyTree) -> PyTree:
+        """Multiply with an approximate inverse, corrected by what the steps changed."""
+        rest, along = self.before(gradient)
+        return self.after(inverse(rest), along)
+
     def _weight(self) -> Array:
         curvature = dot(self.step, self.change)
         return jnp.where(curvature > 0, 1.0 / jnp.where(curvature > 0, curvature, 1.0), 0.0)
+
+
+class Learnt(eqx.Module):
+    """An approximate inverse, corrected by what iterations have found of the matrix."""
+
+    inverse: Callable[[PyTree], PyTree]
+    secants: Secants
+
+    def __call__(self, gradient: PyTree) -> PyTree:
+        """Multiply with it."""
+        return self.secants.corrected(self.inverse, gradient)
 
 
 class _Direction(eqx.Module):
@@ -156,6 +189,7 @@ class _Direction(eqx.Module):
     point: Any
     gradient: Any
     secants: Secants
+    iterated: Secants  # with the Gauss–Newton matrix
     result: optx.RESULTS
 
 
@@ -180,9 +214,9 @@ class PreconditionedDescent(optx.AbstractDescent):
     def init(self, y, f_info_struct):
         """Start without a direction."""
         del f_info_struct
-        none = jax.tree.map(lambda v: jnp.zeros((_MEMORY, *v.shape), v.dtype), y)
-        secants = Secants(none, none)
-        return _Direction(y, jnp.full((), jnp.inf), jnp.zeros((), int), y, y, secants, optx.RESULTS.successful)
+        secants, iterated = (Secants.none(y, memory) for memory in (_MEMORY, _MEMORY_OF_ITERATIONS))
+        infinite, none = jnp.full((), jnp.inf), jnp.zeros((), int)
+        return _Direction(y, infinite, none, y, y, secants, iterated, optx.RESULTS.successful)
 
     def query(self, y, f_info, state):
         """Solve for the direction at an accepted point."""
@@ -195,12 +229,14 @@ class PreconditionedDescent(optx.AbstractDescent):
         def further(gradient):
             return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
 
-        solved = least_squares(J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, self.negligible, further)
+        solved = least_squares(
+            J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, self.negligible, further, state.iterated
+        )
         gradient, known = solved.gradient, secants(solved.gradient)
         newton = known.after(solved.x, known.before(gradient)[1])
         relative = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
         iterations = state.iterations + solved.iterations
-        return _Direction(newton, relative, iterations, y, gradient, known, optx.RESULTS.successful)
+        return _Direction(newton, relative, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful)
 
     def step(self, step_size, state):
         """Go a part of the way."""
