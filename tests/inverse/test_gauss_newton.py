@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 
-from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
+from opfem.inverse.gauss_newton import GaussNewton, Learnt, PreconditionedDescent, Secants, least_squares
 
 
 def test_settles_where_residuals_curve_more_than_gauss_newton_knows():
@@ -31,3 +32,25 @@ def test_settles_where_residuals_curve_more_than_gauss_newton_knows():
     newton = jnp.linalg.solve(jax.hessian(half_sum)(y), jax.grad(half_sum)(y))
     assert jnp.all(jnp.linalg.eigvalsh(jax.hessian(half_sum)(y)) > 0)
     assert jnp.linalg.norm(newton) < 1e-3 * jnp.linalg.norm(y)
+
+
+def test_iterations_precondition_the_next_system():
+    """Ten directions stand out; iterations of one system learn them."""
+    rng = np.random.default_rng(1)
+    size = jnp.asarray(np.concatenate([np.geomspace(5.0, 50.0, 10), 1.0 + 0.1 * rng.random(190)]))
+    Q, _ = jnp.linalg.qr(jnp.asarray(rng.standard_normal((200, 200))))
+    A, first, second = Q * size @ Q.T, *jnp.asarray(rng.standard_normal((2, 200)))
+
+    def plain(gradient):
+        return gradient
+
+    def solve(b, secants=None):
+        return least_squares(lambda x: A @ x, lambda r: A.T @ r, plain, b, 1e-2, 100, secants=secants)
+
+    solved = solve(first, Secants.none(first, 60))
+    assert solved.iterations == solve(first).iterations
+    assert solve(second, solved.secants).iterations < 0.4 * solve(second).iterations  # 2 of 11
+    learnt = Learnt(plain, solved.secants)
+    for i in range(10):
+        assert jnp.vdot(Q[:, i], learnt(Q[:, i])) == pytest.approx(float(size[i]) ** -2, rel=1e-3)
+    assert jnp.vdot(first, learnt(second)) == pytest.approx(float(jnp.vdot(second, learnt(first))), rel=1e-9)
