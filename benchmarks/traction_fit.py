@@ -150,7 +150,8 @@ def cost_case(elements: list[int], missing: float, block: float, times: int) -> 
         palpation = experiment((n, n, max(2, n // 10)), n * ELEMENT)
         prior = op.Matern(length=0.6, std=1.5e-3, mean=3e-3)
         truth = prior_field(palpation, prior, seed=5)
-        solution = op.solve(palpation, op.Traction(truth))
+        settings = op.Newton(max_path=12)  # those of the fit; the first solve compiles
+        solution = op.solve(palpation, op.Traction(truth), settings)
         heights = surface(palpation, solution, 4 * n + 1)
         rng = np.random.default_rng(2)
         edge = int(np.sqrt(block) * heights.shape[0])
@@ -169,7 +170,7 @@ def cost_case(elements: list[int], missing: float, block: float, times: int) -> 
                 fit = op.fit_traction(palpation, measured, prior, draws=2)
                 seconds.append(round(time.perf_counter() - begin, 1))
             begin = time.perf_counter()
-            jax.block_until_ready(op.solve(palpation, op.Traction(1.001 * truth), op.Newton(max_path=12)).pressure)
+            jax.block_until_ready(op.solve(palpation, op.Traction(1.001 * truth), settings).pressure)
             forward = time.perf_counter() - begin
             begin = time.perf_counter()
             iterations = int(fit.posterior.draw(jax.random.key(1))[2]) + 1

@@ -55,7 +55,7 @@ def fit_traction(
     parameters: Mapping[str, AbstractNumberPrior] | None = None,
     forces: ForceReading | Sequence[ForceReading] | None = None,
     inside: AxialDisplacement | Sequence[AxialDisplacement] | None = None,
-    lateral: AbstractPrior | None = None,
+    lateral: AbstractPrior | ArrayLike | None = None,
     nonnegative: bool = False,
     model_std: ScalarLike = 0.0,
     hyperparameters: Choice = "given",
@@ -83,9 +83,9 @@ def fit_traction(
             scaled with) and "l0_offset" [mm]. With a narrow prior: an uncertainty to allow for.
         forces: Reading of the total force under each map.
         inside: Displacements inside the layer under each map.
-        lateral: Prior of each component of the lateral traction, then fitted as well; its mean may be the lateral
-            traction of an imprint, `(2, ny+1, nx+1)`. A thickness map says little of it: `stats["lateral_informed"]`
-            of the fit tells how much.
+        lateral: The lateral traction `(2, ny+1, nx+1)` [MPa] where it is known, such as `traction[:2]` of an imprint:
+            beside rubbing, a steep surface pushes sideways. Or the prior of each of its components: it is then fitted
+            as well. A thickness map says little of it: `stats["lateral_informed"]` of the fit tells how much.
         nonnegative: Keep the pressure above zero.
         model_std: Standard deviation of the computed height [mm], independent from element to element: what the mesh
             misses, above all. Pixels are many, so that without it a coarse mesh is believed more than it deserves; a
@@ -124,7 +124,8 @@ def fit_traction(
         palpation=palpation,
         observations=observations,
         prior=prior,
-        lateral=lateral,
+        lateral=lateral if isinstance(lateral, AbstractPrior) else None,
+        known_lateral=None if lateral is None or isinstance(lateral, AbstractPrior) else jnp.asarray(lateral),
         parameters=parameters,
         forces=stacked("forces", forces, len(maps)),
         inside=stacked("inside", inside, len(maps)),

@@ -60,6 +60,13 @@ def check_inputs(
     nx, ny, _ = palpation.elements
     if min(nx, ny) < 4:
         raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
+    if lateral is not None and not isinstance(lateral, AbstractPrior):
+        if np.shape(lateral) != (2, ny + 1, nx + 1) or not np.all(np.isfinite(lateral)):
+            raise ValueError(
+                f"fit_traction.lateral [MPa] must be a prior, such as Matern(...), or finite with shape "
+                f"{(2, ny + 1, nx + 1)}: x then y on interface nodes; got shape {np.shape(lateral)}."
+            )
+        lateral = None
     for name, one in (("prior", prior), ("lateral", lateral)):
         if one is None and name == "lateral":
             continue

@@ -33,7 +33,8 @@ class Misfit(eqx.Module):
         palpation: The experiment, fitted numbers at their priors' centres.
         observations: Of every map, stacked.
         prior: Of the normal traction.
-        lateral: Of each component of the lateral traction; None: it follows friction.
+        lateral: Of each component of the lateral traction; None: it is not fitted.
+        known_lateral: Lateral traction `(2, ny+1, nx+1)` [MPa] where it is not fitted; None: it follows friction.
         parameters: Priors of fitted numbers, by name.
         forces: Force readings, stacked; None without.
         inside: Displacements inside the layer, stacked; None without.
@@ -46,6 +47,7 @@ class Misfit(eqx.Module):
     observations: Observation
     prior: AbstractPrior
     lateral: AbstractPrior | None
+    known_lateral: Array | None
     parameters: dict[str, AbstractNumberPrior]
     forces: ForceReading | None
     inside: AxialDisplacement | None
@@ -97,7 +99,7 @@ class Misfit(eqx.Module):
         """Compute the load of every map, stacked."""
         dead, stiffness = self.bed.load(self.asked(white)), self.bed.stiffness
         if self.lateral is None or white.lateral is None:
-            return jax.vmap(lambda normal: Traction(normal, None, stiffness))(dead)
+            return jax.vmap(lambda normal: Traction(normal, self.known_lateral, stiffness))(dead)
         spacing, prior = self.palpation.mesh().spacing, self.lateral
         mean = on_nodes(prior, white.lateral.shape[1:])
         lateral = mean + jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)

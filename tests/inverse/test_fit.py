@@ -186,6 +186,7 @@ def test_errors_say_what_to_do():
 
     refused(r"Matern\.length \[mm\].*element", prior=op.Matern(0.05, 1e-3))
     refused("at least 4 elements", experiment=palpation((3, 12, 2)))
+    refused(r"lateral \[MPa\].*\(2, 13, 13\).*got shape \(13, 13\)", lateral=np.zeros((13, 13)))
     refused("hexahedra", experiment=dataclasses.replace(palpation(), element="tet10"))
     refused(r"parameters name numbers .* got 'c10'", parameters={"c10": op.Normal(1.0, 0.1)})
     refused("forces needs one for each of 1 maps, got 2", forces=[op.ForceReading(1.0, 0.1)] * 2)
@@ -299,6 +300,11 @@ def test_lateral_traction_rests_on_its_prior(small):
     assert jnp.linalg.norm(fit.normal - known) < 0.2 * jnp.linalg.norm(known - known.mean())
     assert fit.stats["lateral_informed"] < 0.3
     assert jnp.sqrt(jnp.mean((fit.traction[:2] - rubbed) ** 2)) < 2e-4
+    told = op.fit_traction(
+        experiment, small_map(small), prior, lateral=rubbed, solver=settings, draws=1, progress=False
+    )
+    assert jnp.linalg.norm(told.normal - known) < 0.2 * jnp.linalg.norm(known - known.mean())
+    assert told.traction[:2] == pytest.approx(np.asarray(rubbed), abs=1e-12)
     with pytest.raises(ValueError, match=r"Matern.mean \[MPa\].*\(2, ny\+1, nx\+1\) = \(2, 7, 7\), got \(7, 7\)"):
         op.fit_traction(experiment, small_map(small), prior, lateral=op.Matern(0.6, 2e-4, mean=known), solver=settings)
 
