@@ -19,6 +19,8 @@ from jaxtyping import Array, PyTree
 # that least, but between these parts of the last.
 _BEYOND = 0.6
 _SHORTEST, _LONGEST = 0.1, 0.5
+# A system is solved no closer than its last direction changed the residuals, but at least to this.
+_ROUGHEST = 0.03
 # Steps whose curvature is remembered, and iterations of linear systems.
 _MEMORY = 20
 _MEMORY_OF_ITERATIONS = 60
@@ -198,7 +200,7 @@ class PreconditionedDescent(optx.AbstractDescent):
 
     Attributes:
         precondition: Makes, from J, an approximate inverse of JᵀJ.
-        rtol: Relative tolerance of each linear system.
+        rtol: Relative tolerance of linear systems near the optimum; far from it they are solved less closely.
         most: Most iterations of each.
         negligible: What is left to go, over the posterior's standard deviation along it, below which a direction is
             not refined [-].
@@ -229,8 +231,9 @@ class PreconditionedDescent(optx.AbstractDescent):
         def further(gradient):
             return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
 
+        rtol = jnp.clip(state.change, self.rtol, _ROUGHEST)
         solved = least_squares(
-            J.mv, J.T.mv, self.precondition(J), residual, self.rtol, most, self.negligible, further, state.iterated
+            J.mv, J.T.mv, self.precondition(J), residual, rtol, most, self.negligible, further, state.iterated
         )
         gradient, known = solved.gradient, secants(solved.gradient)
         newton = known.after(solved.x, known.before(gradient)[1])
