@@ -268,7 +268,7 @@ def coin_fit(
 
 def plot_beside_imprint(fits: list[op.TractionFit], imprint: op.Solution, out: Path) -> None:
     """Draw the pressure of fits and imprint, and where they differ: one row each."""
-    side, highest = float(imprint.palpation.extent[0]), 1e3 * float(fits[0].pressure.max())
+    side, highest = float(imprint.palpation.extent[0]), 1e3 * float(imprint.pressure.max())
     figure, axes = plt.subplots(len(fits), 3, figsize=(11.0, 3.4 * len(fits)), layout="compressed", sharex=True)
     for row, fit, lateral in zip(axes, fits, ("friction", "that of the imprint"), strict=True):
         parts = (

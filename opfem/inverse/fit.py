@@ -153,12 +153,6 @@ def fit_traction(
         fit = _result(reached, run, several, draws, key, bar)
     if bool(fit.result == FitStatus.successful) and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
-    if cut_short := fit.stats["draws_cut_short"]:
-        warnings.warn(
-            f"{cut_short} of {draws} draws were cut short after {MOST_ITERATIONS} iterations: standard deviations and "
-            "degrees of freedom are rough. Give the prior a smaller std or a longer length.",
-            stacklevel=2,
-        )
     return fit
 
 

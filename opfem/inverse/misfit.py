@@ -185,13 +185,11 @@ def carried(residuals: dict[str, Any]) -> Float[Array, "maps my mx"]:
     return residuals["normal"] / _RIDES_ALONG
 
 
-@eqx.filter_jit
 def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:
     """Multiply the posterior covariance of the normal traction with weights [-]."""
     nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), posterior.residual_structure())
-    J = posterior.jacobian
-    pulled = J.T.mv({**nothing, "normal": weights / _RIDES_ALONG})
-    return carried(J.mv(posterior.covariance(pulled)))
+    pulled = posterior.pull({**nothing, "normal": weights / _RIDES_ALONG})
+    return carried(posterior.push(posterior.covariance(pulled)))
 
 
 def _one_by_one(function, stacked):

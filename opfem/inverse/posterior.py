@@ -1,5 +1,6 @@
 """The posterior around the optimum (Laplace): draws, and what they say of every derived number."""
 
+import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from .._checks import concrete
 from .gauss_newton import LeastSquares, least_squares, plus
 
 # Most iterations of each linear system, and the relative gradient that it is solved to.
@@ -38,11 +40,29 @@ class Posterior(eqx.Module):
             gradient: What to add to the right-hand side of the normal equations; None: nothing.
 
         Returns:
-            The solution; NaN where the iteration diverged.
+            The solution; NaN where the iteration diverged. Where it was cut short, a warning says so, unless the number
+            of iterations is traced.
         """
         if gradient is None:
             gradient = jax.tree.map(jnp.zeros_like, self.white)
-        return _solve(self, residual, gradient)
+        solved = _solve(self, residual, gradient)
+        iterations = concrete(solved.iterations)
+        if iterations is not None and iterations >= MOST_ITERATIONS:
+            warnings.warn(
+                f"A linear system of the posterior was cut short after {MOST_ITERATIONS} iterations: what is made from "
+                "it (draws, standard deviations, covariances, degrees of freedom) is rough. Give the prior a smaller "
+                "std or a longer length.",
+                stacklevel=3,
+            )
+        return solved
+
+    def push(self, change: PyTree) -> PyTree:
+        """Multiply a change of the unknowns with the Jacobian."""
+        return _push(self.jacobian, change)
+
+    def pull(self, residuals: PyTree) -> PyTree:
+        """Multiply residuals with its transpose."""
+        return _pull(self.jacobian, residuals)
 
     def residual_structure(self) -> PyTree:
         """Return shapes and types of the residuals."""
@@ -70,6 +90,10 @@ class Posterior(eqx.Module):
         )
         solved = self.solve(noise)
         return solved.x, plus(noise, solved.rest, -1.0), solved.iterations
+
+
+_push = eqx.filter_jit(lambda J, change: J.mv(change))
+_pull = eqx.filter_jit(lambda J, residuals: J.T.mv(residuals))
 
 
 # One compiled program for all that a posterior is asked: products with the Jacobian are large.

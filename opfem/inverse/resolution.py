@@ -1,8 +1,5 @@
 """Effective resolution: what a point of the true traction is smeared over in the fitted one."""
 
-from typing import Any
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +7,6 @@ from jaxtyping import Array, Float
 
 from .misfit import Misfit, carried
 from .posterior import Posterior
-from .preconditioner import Unknowns
 
 # Points along each axis.
 _GRID = 4
@@ -55,14 +51,9 @@ def _image(posterior: Posterior, misfit: Misfit, points: Array) -> Array:
         return jax.vmap(lambda part: prior.whiten(part, spacing))(points / slope)
 
     change = jax.tree.map(jnp.zeros_like, posterior.white)._replace(normal=asked(points))
-    residuals = _multiply(posterior, change)
+    residuals = posterior.push(change)
     for _ in range(_PASSES):
         change = change._replace(normal=change.normal + asked(points - carried(residuals)))
-        residuals = _multiply(posterior, change)
+        residuals = posterior.push(change)
     told = {name: part if name == "maps" else jax.tree.map(jnp.zeros_like, part) for name, part in residuals.items()}
-    return carried(_multiply(posterior, posterior.solve(told).x))
-
-
-@eqx.filter_jit
-def _multiply(posterior: Posterior, change: Unknowns) -> dict[str, Any]:
-    return posterior.jacobian.mv(change)
+    return carried(posterior.push(posterior.solve(told).x))

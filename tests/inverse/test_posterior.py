@@ -1,5 +1,6 @@
 """The linear-Gaussian oracle (VALIDATION.md test 39): posterior, degrees of freedom and misfit in closed form."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -65,6 +66,12 @@ def test_draws_have_the_posterior_covariance(modes, posterior):
     formula = 1.0 / (1.0 + variance * gain**2 / NOISE**2)
     draws, _, _ = jax.vmap(posterior.draw)(jax.random.split(jax.random.key(1), 2000))
     assert jnp.mean(draws**2 / formula, axis=0) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 2000))
+
+
+def test_a_system_that_is_cut_short_is_told(posterior):
+    never = eqx.tree_at(lambda p: p.rtol, posterior, 0.0)
+    with pytest.warns(UserWarning, match="cut short after 200 iterations"):
+        never.draw(jax.random.key(0))
 
 
 def test_least_squares_against_numpy():
