@@ -62,7 +62,7 @@ def fit_traction(
     start: ArrayLike | None = None,
     solver: Newton = Newton(max_path=12),
     rtol: float = 3e-3,
-    max_steps: int = 30,
+    max_steps: int = 50,
     draws: int = 16,
     key: PRNGKeyArray | None = None,
     throw: bool = True,
@@ -142,7 +142,9 @@ def fit_traction(
             # The layer snaps on its way under a dead load: hold it, and start from the imprint.
             run.misfit = eqx.tree_at(lambda m: m.bed, misfit, bed)
             reached = run.fit(misfit.white(bed.normal))
-        if _failed(reached) and bool(reached.result != FitStatus.max_steps_reached) and prior.mean is not None:
+        ended = reached.result
+        near = (ended == FitStatus.max_steps_reached) | ((ended == FitStatus.stalled) & (bed is not None))
+        if _failed(reached) and not bool(near) and prior.mean is not None:
             # The start pulls and presses harder than the layer takes: start from what the prior expects.
             run.misfit = misfit
             reached = run.fit(jax.tree.map(jnp.zeros_like, reached.white))

@@ -19,6 +19,8 @@ from jaxtyping import Array, PyTree
 # that least, but between these parts of the last.
 _BEYOND = 0.6
 _SHORTEST, _LONGEST = 0.1, 0.5
+# Steps shorter than this may raise the sum of squares by this part.
+_SHORT, _RISE = 0.05, 5e-3
 # A system is solved no closer than its last direction changed the residuals, but at least to this.
 _ROUGHEST = 0.03
 # Steps whose curvature is remembered, and iterations of linear systems.
@@ -257,6 +259,9 @@ class Interpolating(optx.AbstractSearch):
     The next direction is first looked along as far as the least of the last one lay. A direction costs tens of
     products, a look along it one solve. What the Jacobian says comes with the direction: unlike in
     `optimistix.BacktrackingArmijo`, it is not multiplied with once more.
+
+    The sum of squares jumps where a forward solve cuts an increment back: friction remembers another path. A point that
+    a jump put lower than its surroundings would never be left, so the shortest steps may rise a little.
     """
 
     def init(self, y, f_info_struct):
@@ -265,15 +270,17 @@ class Interpolating(optx.AbstractSearch):
         return _Search(jnp.ones(()), jnp.zeros(()))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        """Accept a point that is no worse, and not far beyond the least of the parabola through it."""
+        """Accept a point that is no worse, and not far beyond the least of the parabola through it; or one close by."""
         del y, y_eval
         length, before, now = state.step_size, f_info.as_min(), f_eval_info.as_min()
         fall = state.change**2 * before  # that a whole step promises; the slope is twice it
         curvature = (now - before + 2.0 * fall * length) / length**2
         least = jnp.where(jnp.isfinite(now), fall / jnp.where(curvature > 0, curvature, fall), 0.0)
-        accept = first_step | ((now <= before) & (least >= _BEYOND * length))
+        lower = (now <= before) & (least >= _BEYOND * length)
+        close = (length < _SHORT) & (now <= (1.0 + _RISE) * before)
+        accept = first_step | lower | close
         shorter = jnp.clip(least, _SHORTEST * length, _LONGEST * length)
-        length = jnp.where(accept, jnp.where(first_step, 1.0, jnp.minimum(least, 1.0)), shorter)
+        length = jnp.where(accept, jnp.where(lower, jnp.minimum(least, 1.0), 1.0), shorter)
         return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 
