@@ -76,8 +76,16 @@ def solve(
 @eqx.filter_jit
 def _prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
     problem = discretise(palpation, load, load_start, solver.face_rule)
+    initial = problem.initial_state()
     if state is None:
-        return problem, begin(problem.initial_state(), solver, traced)
+        return problem, begin(initial, solver, traced)
+    if jax.tree.structure(state) != jax.tree.structure(initial):
+        raise ValueError(
+            "A solve continues on the same faces, with the same kind of load: start has other contact, friction or "
+            "mean stress than palpation and load. A Traction with lateral=[MPa] and without stiffness=[MPa/mm] does "
+            "not rub; one with stiffness, or without lateral, does. Start from a solution of the same kind, or from "
+            "none."
+        )
     restarted = eqx.tree_at(lambda s: s.fraction, state, jnp.zeros_like(state.fraction))
     return problem, begin(restarted, solver, traced)
 

@@ -209,6 +209,12 @@ def test_a_bed_of_springs_carries_the_layer_as_a_dead_load_does(rubs):
     assert jnp.abs(let_go.displacement - held.displacement).max() < 1e-4 * jnp.abs(held.displacement).max()
 
 
+def test_start_of_another_kind_is_told():
+    shoved = op.solve(palpation(), op.Traction(1e-3, jnp.zeros((2, *palpation().mesh().thickness.shape))))
+    with pytest.raises(ValueError, match="other contact, friction or mean stress"):
+        op.solve(palpation(), op.Traction(1e-3), start=shoved)
+
+
 def test_start_continues_with_history():
     whole = op.solve(palpation(), op.Imprint(bumpy()), op.Newton(increments=4))
     half_map = op.ThicknessMap(0.5 * (0.5 + bumpy().values), extent=SIZE)
