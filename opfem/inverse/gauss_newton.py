@@ -23,6 +23,8 @@ _SHORTEST, _LONGEST = 0.1, 0.5
 _SHORT, _RISE = 0.05, 5e-3
 # A system is solved no closer than its last direction changed the residuals, but at least to this.
 _ROUGHEST = 0.03
+# No direction of Gauss–Newton changes the residuals by more than their norm, but for rounding.
+_MOST_PROMISED = 1.01
 # Steps whose curvature is remembered, and iterations of linear systems.
 _MEMORY = 20
 _MEMORY_OF_ITERATIONS = 60
@@ -226,22 +228,37 @@ class PreconditionedDescent(optx.AbstractDescent):
         """Solve for the direction at an accepted point."""
         J, residual = f_info.jac, f_info.residual
         most = jnp.where(f_info.as_min() < self.hopeless, self.most, 0)
-
-        def secants(gradient):
-            return state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
-
-        def further(gradient):
-            return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
-
         rtol = jnp.clip(state.change, self.rtol, _ROUGHEST)
-        solved = least_squares(
-            J.mv, J.T.mv, self.precondition(J), residual, rtol, most, self.negligible, further, state.iterated
-        )
-        gradient, known = solved.gradient, secants(solved.gradient)
-        newton = known.after(solved.x, known.before(gradient)[1])
-        relative = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
-        iterations = state.iterations + solved.iterations
-        return _Direction(newton, relative, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful)
+        precondition = self.precondition(J)
+
+        # Where what was learnt of the curvature makes a direction promise too much, it is forgotten, and the system
+        # solved again.
+        def promises_too_much(carry):
+            tries, direction = carry
+            return (tries == 0) | ((tries == 1) & (direction.change > _MOST_PROMISED))
+
+        def solve(carry):
+            tries, last = carry
+
+            def secants(gradient):
+                known = state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
+                return jax.tree.map(lambda v: jnp.where(tries == 0, v, 0.0), known)
+
+            def further(gradient):
+                return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
+
+            solved = least_squares(
+                J.mv, J.T.mv, precondition, residual, rtol, most, self.negligible, further, last.iterated
+            )
+            gradient, known = solved.gradient, secants(solved.gradient)
+            newton = known.after(solved.x, known.before(gradient)[1])
+            change = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
+            iterations = last.iterations + solved.iterations
+            return tries + 1, _Direction(
+                newton, change, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful
+            )
+
+        return jax.lax.while_loop(promises_too_much, solve, (jnp.zeros((), int), state))[1]
 
     def step(self, step_size, state):
         """Go a part of the way."""

@@ -1,7 +1,9 @@
 """Gauss–Newton steps that learn the curvature of residuals."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
@@ -32,6 +34,24 @@ def test_settles_where_residuals_curve_more_than_gauss_newton_knows():
     newton = jnp.linalg.solve(jax.hessian(half_sum)(y), jax.grad(half_sum)(y))
     assert jnp.all(jnp.linalg.eigvalsh(jax.hessian(half_sum)(y)) > 0)
     assert jnp.linalg.norm(newton) < 1e-3 * jnp.linalg.norm(y)
+
+
+def test_a_secant_that_makes_a_direction_promise_too_much_is_forgotten():
+    """Along (1, 0) the gradient rose across: with that, the matrix is singular but for 1 %."""
+    residual, y = jnp.array([1.0, 1.0]), jnp.zeros(2)
+    J = lx.IdentityLinearOperator(jax.eval_shape(lambda: residual))
+    descent = PreconditionedDescent(
+        lambda J: lambda g: g, jnp.asarray(1e-8), jnp.asarray(60), jnp.asarray(0.0), jnp.asarray(jnp.inf)
+    )
+    start = descent.init(y, None)
+    step, change = jnp.array([1.0, 0.0]), jnp.array([0.01, 1.0])
+    learnt = start.secants.followed_by(step, change)
+    with_secant = learnt.after(learnt.before(residual)[0], learnt.before(residual)[1])
+    assert residual @ with_secant > 100.0 * (residual @ residual)
+    came = eqx.tree_at(lambda s: (s.point, s.gradient), start, (y - step, residual - change))
+    direction = descent.query(y, optx.FunctionInfo.ResidualJac(residual, J), came)
+    assert direction.newton == pytest.approx(np.asarray(residual), rel=1e-3)
+    assert jnp.all(direction.secants.step == 0.0)
 
 
 def test_iterations_precondition_the_next_system():
