@@ -14,7 +14,7 @@ from .gauss_newton import LeastSquares, least_squares
 from .noise import noise_std
 from .observation import Nodes, Observation, observe
 from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes
-from .transfer import poisson_ratio, transfer_function, wave_numbers
+from .transfer import Base, poisson_ratio, transfer_function, wave_numbers
 
 # Relative gradient at which the linear estimate counts as solved, and most iterations.
 _RTOL = 1e-8
@@ -37,10 +37,16 @@ class LinearEstimate(eqx.Module):
     chi2: Array
 
 
-def response(palpation: Palpation, thickness: ScalarLike) -> Float[Array, "my mx"]:
-    """Compute the indentation per pressure of every cosine mode [mm/MPa]; a window with friction counts as slipping."""
+def response(palpation: Palpation, thickness: ScalarLike, base: Base | None = None) -> Float[Array, "my mx"]:
+    """Compute the indentation per pressure of every cosine mode [mm/MPa].
+
+    Args:
+        palpation: The experiment.
+        thickness: Of the layer [mm].
+        base: What the window does; None: its own kind, where one with friction counts as slipping.
+    """
     mesh, material = palpation.mesh(), palpation.layer.material
-    base = "bonded" if isinstance(palpation.window, Bonded) else "slip"
+    base = base or ("bonded" if isinstance(palpation.window, Bonded) else "slip")
     k = wave_numbers(mesh.thickness.shape, mesh.spacing)
     return transfer_function(k, thickness, material.shear, poisson_ratio(material), base)
 

@@ -1,9 +1,10 @@
 """The fit's preconditioner: the layer as its transfer function, as thick as it was measured.
 
 Indentation grows about with the cube of the local thickness where the layer is thin against the waves of the
-pressure. With that, and with what is masked, the normal matrix is no longer diagonal in cosines, but its products
-cost four transforms: its systems are solved by conjugate gradients of their own. Fitted numbers, coupled to
-everything but few, are added as a coarse space of exact products with the Jacobian.
+pressure; nodes on edges press with half of an element, at corners with a quarter; and a layer under load is stiffer
+for long waves, friction or not. With that, and with what is masked, the normal matrix is no longer diagonal in
+cosines, but its products cost four transforms: its systems are solved by conjugate gradients of their own. Fitted
+numbers, coupled to everything but few, are added as a coarse space of exact products with the Jacobian.
 """
 
 from typing import Any, NamedTuple
@@ -11,9 +12,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ..model import Palpation
+from ..model import Bonded, Palpation
 from .estimates import response
 from .gauss_newton import dot, plus
 from .observation import Nodes, Observation
@@ -22,6 +24,10 @@ from .transfer import wave_numbers
 
 _RTOL = 1e-3
 _STEPS = 200
+# How a layer that slips on its window indents at finite strain: this part as at small strain, the rest as a bonded one.
+# The tangent of 40×40×4 elements at 12 % of strain has 0.46 for the mean and 0.40 for waves as long as 2π thicknesses,
+# but the first direction to 3e-2 takes fewer iterations where it is taken for stiffer: 5 at 0.2, 8 at 0.4, 14 at 1.
+_SLIPPING = 0.2
 
 
 class Unknowns(NamedTuple):
@@ -40,7 +46,8 @@ class Unknowns(NamedTuple):
 
 def indentation(gain: Nodes, softness: Nodes, normal: Nodes) -> Nodes:
     """Compute the small-strain indentation [mm] under a normal traction [MPa], of a layer as thick as it is locally."""
-    return softness * from_cosines(gain * cosine_transform(normal))
+    parts = [np.r_[0.5, np.ones(n - 2), 0.5] for n in normal.shape]
+    return softness * from_cosines(gain * cosine_transform(np.outer(*parts) * normal))
 
 
 class LayerNormal(eqx.Module):
@@ -151,6 +158,14 @@ def fit_normal(palpation: Palpation, observations: Observation, prior: AbstractP
     def one(observation):
         pressed = observation.surface / jnp.mean(observation.surface)
         softness = jnp.clip(pressed, 0.1, 10.0) ** 3
-        return response(palpation, jnp.mean(observation.surface)), softness, observation.precision
+        return _gain(palpation, jnp.mean(observation.surface)), softness, observation.precision
 
     return FitNormal(LayerNormal(prior, mesh.spacing, *jax.vmap(one)(observations)))
+
+
+def _gain(palpation: Palpation, thickness: Array) -> Float[Array, "my mx"]:
+    """Compute the indentation per pressure of every cosine mode [mm/MPa] at finite strain."""
+    if isinstance(palpation.window, Bonded):
+        return response(palpation, thickness)
+    slipping, bonded = (response(palpation, thickness, base) for base in ("slip", "bonded"))
+    return _SLIPPING * slipping + (1.0 - _SLIPPING) * bonded
