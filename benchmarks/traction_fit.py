@@ -430,6 +430,7 @@ def parameters_case(fits: int) -> None:
         for name, (low, high) in intervals.items():
             inside[name] += low <= known[name] <= high
         row = {"index": index, "values": {k: float(v) for k, v in fit.numbers.items()}, "intervals": intervals}
+        row["not_identified"] = fit.not_identified()
         print(json.dumps(row | {"inside": inside, "area_mm2": area, **counts(fit)}), flush=True)
 
 

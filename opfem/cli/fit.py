@@ -130,6 +130,7 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
         "prior_std_kPa": 1e3 * float(fitted.prior.std),
         "fitted_numbers": {name: float(value) for name, value in fitted.numbers.items()},
         "fitted_intervals_95_percent": {name: list(ends) for name, ends in fitted.number_intervals().items()},
+        "not_identified_within_25_percent": fitted.not_identified(0.25),
         "not_observed": {name: list(pair) for name, pair in fitted.unobserved().items()},
         "forward_solves_count": int(stats["forward_solves"]),
         "inner_iterations_count": int(stats["inner_iterations"]),

@@ -159,6 +159,19 @@ class TractionFit(eqx.Module):
             for name, prior in self.misfit.parameters.items()
         }
 
+    def not_identified(self, within: float = 0.25) -> dict[str, float]:
+        """Name fitted numbers that the data do not tell to a part of their value.
+
+        Args:
+            within: Half of the 95 % interval, over the fitted value, that counts as told [-].
+
+        Returns:
+            That part where it is larger, by name [-].
+        """
+        values = self.numbers
+        parts = {n: 0.5 * (high - low) / abs(float(values[n])) for n, (low, high) in self.number_intervals().items()}
+        return {name: part for name, part in parts.items() if part > within}
+
     def number_covariance(self) -> Float[Array, "numbers numbers"]:
         """Compute the posterior covariance of the fitted numbers' white unknowns, each of variance 1 before the fit."""
         names = list(self.misfit.parameters)

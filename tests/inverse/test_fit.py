@@ -65,6 +65,7 @@ def fit(truth):
 def test_fit_finds_the_traction(fit, truth):
     error = jnp.linalg.norm(fit.normal - truth) / jnp.linalg.norm(truth - truth.mean())
     assert fit.result == op.FitStatus.successful
+    assert fit.stats["inner_iterations"] <= 4 * fit.stats["gauss_newton_steps"]
     assert error < 0.05
     thickness = measured(truth, palpation())
     linear = op.linear_estimate(palpation(), thickness, PRIOR).normal
@@ -328,6 +329,10 @@ def test_friction_and_modulus_from_three_maps_and_forces(small):
         assert low < truth[name] < high
         # The data tell: the interval is well inside the prior's.
         assert np.log(high / low) < 0.6 * 2 * 2.58 * 0.5
+    low, high = fit.number_intervals()["window.friction"]
+    assert fit.not_identified(0.1) == {
+        "window.friction": pytest.approx(0.5 * (high - low) / fit.numbers["window.friction"])
+    }
     total = jnp.sum(fit.normal * area, axis=(1, 2))
     assert total == pytest.approx(np.array([float(r.force) for r in readings]), rel=0.02)
 
@@ -351,6 +356,7 @@ def test_two_constants_are_not_told_apart_at_small_strain(small):
     assert re.fullmatch(r"layer\.material\.c01 - 0\.[23]\d? layer\.material\.c10", name)
     after, before = fit.unobserved()[name]
     assert 0.9 < after <= before * 1.001
+    assert fit.not_identified().keys() == fit.numbers.keys()
     covariance = fit.number_covariance()
     assert covariance[0, 1] / jnp.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.5
 
