@@ -68,6 +68,20 @@ def test_draws_have_the_posterior_covariance(modes, posterior):
     assert jnp.mean(draws**2 / formula, axis=0) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 2000))
 
 
+def test_data_of_shorter_waves_fall_faster_than_the_gain_down_to_the_noise(modes):
+    """The discrete Picard condition (VALIDATION.md test 40)."""
+    gain, variance = modes
+    truth, noise = jax.random.normal(jax.random.key(2), (2, 4000, POINTS))
+    data = gain * jnp.sqrt(variance) * truth + NOISE * noise
+    held = jnp.sqrt(jnp.mean(data**2, axis=0))
+    shorter = int(jnp.argmax(gain))
+    seen = shorter + int(jnp.argmax(held[shorter:] < 2.0 * NOISE))
+    # The two waves of each length agree but for sampling: every other one.
+    assert jnp.all(jnp.diff((held / gain)[shorter:seen:2]) < 0.0)
+    assert seen - shorter >= 6
+    assert held[seen + 4 :] == pytest.approx(NOISE, rel=0.06)
+
+
 def test_a_system_that_is_cut_short_is_told(posterior):
     never = eqx.tree_at(lambda p: p.rtol, posterior, 0.0)
     with pytest.warns(UserWarning, match="cut short after 200 iterations"):

@@ -48,6 +48,15 @@ def test_limits_and_no_jumps(base, poisson):
         assert above == pytest.approx(below, rel=1e-7, abs=1e-8)
 
 
+@pytest.mark.parametrize(("poisson", "uniform", "peak"), [(0.47541, 4.04, 15.0), (0.499, 0.17, 13.8), (0.5, 0.0, 13.7)])
+def test_uniform_pressure_hardly_indents_a_bonded_incompressible_layer(poisson, uniform, peak):
+    """VALIDATION.md test 40, mm/MPa: its figures are of moduli between 5.80 and 5.87 kPa, the layer's own."""
+    shear = 2 * (2.23e-3 + 7.03e-4)
+    gain = transfer_function(jnp.linspace(0.0, 20.0, 401), 0.5, shear, poisson, "bonded")
+    assert gain[0] == pytest.approx(uniform, rel=0.012, abs=1e-12)
+    assert gain.max() == pytest.approx(peak, rel=0.012)
+
+
 def test_derivatives_are_finite_everywhere():
     slope = jax.vmap(jax.grad(lambda k: transfer_function(k, 0.5, 1.0, 0.475, "bonded")))
     assert jnp.all(jnp.isfinite(slope(jnp.array([0.0, 1e-5, 1.0, 50.0, 1e4]))))
