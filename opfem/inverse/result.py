@@ -175,6 +175,8 @@ class TractionFit(eqx.Module):
     def number_covariance(self) -> Float[Array, "numbers numbers"]:
         """Compute the posterior covariance of the fitted numbers' white unknowns, each of variance 1 before the fit."""
         names = list(self.misfit.parameters)
+        if not names:
+            return jnp.zeros((0, 0))
         nothing = jax.tree.map(jnp.zeros_like, self.posterior.white)
 
         def column(one):
