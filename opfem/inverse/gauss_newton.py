@@ -221,7 +221,7 @@ class PreconditionedDescent(optx.AbstractDescent):
         """Start without a direction."""
         del f_info_struct
         secants, iterated = (Secants.none(y, memory) for memory in (_MEMORY, _MEMORY_OF_ITERATIONS))
-        infinite, none = jnp.full((), jnp.inf), jnp.zeros((), int)
+        infinite, none = jnp.full((), jnp.inf, float), jnp.zeros((), int)
         return _Direction(y, infinite, none, y, y, secants, iterated, optx.RESULTS.successful)
 
     def query(self, y, f_info, state):
