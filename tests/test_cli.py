@@ -1,4 +1,4 @@
-"""`opfem palpate`: what it writes, what it refuses, and how it ends when something goes wrong."""
+"""`opfem palpate` and `opfem fit`: what they write, what they refuse, and how they end when something goes wrong."""
 
 import json
 import os
@@ -16,6 +16,7 @@ from PIL import Image
 
 import opfem as op
 from opfem import cli
+from opfem.cli.fit import FILES as FIT_FILES
 
 SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
 
@@ -87,6 +88,24 @@ def test_palpate_from_map_to_files(tmp_path, map_file, capsys):
     assert "1 missing and filled" in said
     assert f"{numbers['pressure_mean_kPa']:.3g}" in said
     assert "kPa" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [(), ("--modulus-spread", 0.2)])
+def test_fit_from_map_to_files(tmp_path, map_file, spread):
+    out = tmp_path / "stress"
+    assert opfem("fit", map_file, *SMALL, *spread, "--std", 2e-3, "--draws", 2, "--out", out) == 0
+    assert sorted(os.listdir(out)) == sorted(FIT_FILES)
+
+    dataset = op.read_netcdf(out / "result.nc")
+    assert dataset.attrs["fit_status"] == "successful"
+    assert dataset.pressure_std.shape == (7, 7)
+    numbers = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert numbers["pressure_std_max_kPa"] == pytest.approx(1e3 * float(dataset.pressure_std.max()))
+    assert list(numbers["fitted_numbers"]) == (["layer.material.c10"] if spread else [])
+    for name, (low, high) in numbers["fitted_intervals_95_percent"].items():
+        assert low < numbers["fitted_numbers"][name] < high
+    assert pyvista.read(out / "result.vtu").n_cells == 72
 
 
 def test_defaults_are_the_published_case(tmp_path, map_file, solved):

@@ -184,6 +184,8 @@ def _show(numbers: dict[str, Any], out: Path) -> None:
     console.print(table)
     if numbers["advice"]:
         console.print(numbers["advice"], style="yellow")
+    for name, part in numbers["not_identified_within_25_percent"].items():
+        console.print(f"The data tell {name} to {100 * part:.0f} % only.", style="yellow")
     for name, (after, before) in numbers["not_observed"].items():
         console.print(f"The map hardly tells: {name} ({after:.3g} after, {before:.3g} before the fit).", style="yellow")
     console.print(f"Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)

@@ -12,16 +12,17 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
-from ..model import Palpation
+from ..mechanics.face import tributary_area
+from ..model import Contact, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .bed import lay_bed, no_bed
 from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
-from .hyperparameters import most_likely, rescaled
+from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
-from .misfit import Misfit, carried, moved, pressure_change
+from .misfit import Misfit, carried, moved, number_covariance, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
 from .posterior import MOST_ITERATIONS, Posterior
@@ -38,6 +39,8 @@ _CG_NEGLIGIBLE = 0.03
 _CG_STEPS = 60
 # The same with lateral tractions: where the window slips, little holds the layer, and no preconditioner knows it.
 _CG_STEPS_LATERAL = 300
+# Mean pressure over the shear modulus from which on the layer counts as pressed against its window.
+_PRESSED = 1e-4
 # Part of a direction below which a fit stalls.
 _LEAST_PART = 5e-3
 # A non-negative pressure bends towards zero below this part of the shear modulus.
@@ -114,7 +117,7 @@ def fit_traction(
         FitError: If the fit fails and `throw` is True.
     """
     require_float64(palpation)
-    parameters = dict(parameters or {})
+    parameters = dict(sorted((parameters or {}).items()))  # as every PyTree has them
     maps = as_tuple(thickness)
     check_inputs(palpation, maps, prior, lateral, parameters)
     several = not isinstance(thickness, ThicknessMap)
@@ -142,6 +145,9 @@ def fit_traction(
             # The layer snaps on its way under a dead load: hold it, and start from the imprint.
             run.misfit = eqx.tree_at(lambda m: m.bed, misfit, bed)
             reached = run.fit(misfit.white(bed.normal))
+            if not _failed(reached) and not bool(_pressed(reached, palpation)):
+                # Off its window, the layer rests on the springs alone.
+                reached = reached._replace(result=FitStatus.not_carried)
         ended = reached.result
         near = (ended == FitStatus.max_steps_reached) | ((ended == FitStatus.stalled) & (bed is not None))
         if _failed(reached) and not bool(near) and prior.mean is not None:
@@ -153,7 +159,9 @@ def fit_traction(
         if throw and _failed(reached):
             raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
         fit = _result(reached, run, several, draws, key, bar)
-    if bool(fit.result == FitStatus.successful) and fit.reduced_chi2 > 1.0 and fit.advice():
+    # The discrepancy principle holds a fit back on purpose.
+    judged = bool(fit.result == FitStatus.successful) and hyperparameters != "discrepancy"
+    if judged and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
     return fit
 
@@ -170,6 +178,15 @@ class _Reached(NamedTuple):
 
 def _failed(reached: _Reached) -> bool:
     return bool(reached.result != FitStatus.successful)
+
+
+def _pressed(reached: _Reached, palpation: Palpation) -> Array:
+    """Tell whether the layer is pressed against its window under every map, or cannot leave it."""
+    if not isinstance(palpation.window, Contact):
+        return jnp.asarray(True)
+    area = tributary_area(palpation.mesh().positions()[:, -1])
+    mean = jnp.sum(carried(reached.residuals) * area, axis=(1, 2)) / jnp.sum(area)
+    return jnp.all(mean > _PRESSED * palpation.layer.material.shear)
 
 
 class _Run:
@@ -250,8 +267,7 @@ def _draw(posterior: Posterior, key: PRNGKeyArray):
 
 def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyArray) -> _Reached:
     """Fit again under other hyper-parameters, each fit from the last, until they settle."""
-    low, high = -np.inf, np.inf  # logarithms of factors on the standard deviation that are too small, too large
-    factor = 0.0
+    factor, tried = 0.0, []  # logarithm of what the standard deviation was multiplied with
     for _ in range(_MOST_CHOICES):
         misfit, prior = run.misfit, run.misfit.prior
         normal = carried(reached.residuals)
@@ -261,9 +277,8 @@ def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyA
             chosen, change = most_likely(prior, (normal + jnp.stack(around) - mean).reshape(-1, *mean.shape), misfit)
         else:
             reduced = float(jnp.sum(reached.residuals["maps"] ** 2) / jnp.sum(misfit.observations.informed))
-            low, high = (factor, high) if reduced > 1.0 else (low, factor)
-            step = np.log(2.0) if np.isinf(high - low) else 0.5 * (high - low)
-            target = (low + step) if np.isfinite(low) else (high - step)
+            tried.append((factor, np.log(max(reduced, 1e-12))))
+            target = next_factor(tried)
             change, chosen, factor = abs(target - factor), rescaled(prior, np.exp(target - factor)), target
         run.misfit = eqx.tree_at(lambda m: m.prior, misfit, chosen)
         asking = run.misfit.white(misfit.asked(reached.white))
@@ -314,6 +329,7 @@ def _result(
         resolution_width=one_or_all(widths),
         deviations=deviations if several else deviations[:, 0],
         number_deviations=numbers,
+        number_covariance=number_covariance(reached.posterior),
         misfit=misfit,
         posterior=reached.posterior,
         stats={

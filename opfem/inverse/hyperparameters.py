@@ -5,6 +5,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
@@ -15,6 +16,8 @@ from .transfer import wave_numbers
 P = TypeVar("P", bound=AbstractPrior)
 # Most steps of the search.
 _MOST_STEPS = 200
+# χ² falls about with this power of a prior's standard deviation, at least with the next; longest step of its logarithm.
+_POWER, _LEAST_POWER, _LONGEST = -2.0, -0.5, np.log(8.0)
 
 
 def rescaled(prior: P, factor: float | Array) -> P:
@@ -25,6 +28,28 @@ def rescaled(prior: P, factor: float | Array) -> P:
         return eqx.tree_at(lambda p: p.weight, prior, prior.weight / factor)
     assert isinstance(prior, TotalVariation)
     return eqx.tree_at(lambda p: p.weight, prior, prior.weight / factor**2)
+
+
+def next_factor(tried: list[tuple[float, float]]) -> float:
+    """Find what a standard deviation is to be multiplied with so that χ² of the map is its number of data.
+
+    By the secant through the last two fits, between those of too large and those of too small a χ².
+
+    Args:
+        tried: Of each fit so far, the logarithms of the factor and of χ² over the number of data [-].
+
+    Returns:
+        Logarithm of the factor.
+    """
+    factor, excess = tried[-1]
+    power = _POWER
+    if len(tried) > 1:
+        before, other = tried[-2]
+        power = min((excess - other) / (factor - before), _LEAST_POWER)
+    target = factor - float(np.clip(excess / power, -_LONGEST, _LONGEST))
+    low = max((f for f, e in tried if e > 0.0), default=-np.inf)
+    high = min((f for f, e in tried if e <= 0.0), default=np.inf)
+    return target if low < target <= high else 0.5 * (low + high)
 
 
 def most_likely(

@@ -192,6 +192,22 @@ def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"])
     return carried(posterior.push(posterior.covariance(pulled)))
 
 
+def number_covariance(posterior: Posterior) -> Float[Array, "numbers numbers"]:
+    """Compute the posterior covariance of the fitted numbers' white unknowns [-]."""
+    names = list(posterior.white.numbers)
+    if not names:
+        return jnp.zeros((0, 0))
+    nothing = jax.tree.map(jnp.zeros_like, posterior.white)
+
+    def column(one):
+        weights = nothing._replace(numbers=dict(zip(names, one, strict=True)))
+        pulled = posterior.covariance(weights).numbers
+        return jnp.stack([pulled[name] for name in names])
+
+    columns = jnp.stack([column(one) for one in jnp.eye(len(names))])
+    return 0.5 * (columns + columns.T)
+
+
 def _one_by_one(function, stacked):
     if jax.tree.leaves(stacked)[0].shape[0] == 1:
         return jax.tree.map(lambda v: v[None], function(jax.tree.map(lambda v: v[0], stacked)))

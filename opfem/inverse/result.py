@@ -73,6 +73,8 @@ class TractionFit(eqx.Module):
             the mesh itself is the limit.
         deviations: Draws of the normal traction minus the optimum, which standard deviations come from [MPa].
         number_deviations: The same of fitted numbers, of their white unknowns [-], by name.
+        number_covariance: Posterior covariance of those white unknowns, each of variance 1 before the fit, in the order
+            of `numbers` [-].
         misfit: What was minimised, with the prior as chosen.
         posterior: The posterior of the white unknowns.
         stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (each one product with the Jacobian and one
@@ -94,6 +96,7 @@ class TractionFit(eqx.Module):
     resolution_width: Float[np.ndarray, "*maps points"]
     deviations: Array
     number_deviations: dict[str, Float[Array, " draws"]]
+    number_covariance: Float[Array, "numbers numbers"]
     misfit: Misfit
     posterior: Posterior
     stats: dict[str, Any]
@@ -134,8 +137,8 @@ class TractionFit(eqx.Module):
         if self.reduced_chi2 > _CHI2_BOUNDS[1]:
             return (
                 f"χ² per degree of freedom is {self.reduced_chi2:.3g} and should be near 1: the layer cannot explain "
-                "the map (material, friction, L0, mask), or its noise (std) or what the mesh misses (model_std) is "
-                "larger than given. Standard deviations are then too small."
+                "the map (material, friction, L0, mask), its noise (std) or what the mesh misses (model_std) is larger "
+                "than given, or the prior is too strong. Standard deviations are then too small."
             )
         if self.reduced_chi2 < _CHI2_BOUNDS[0]:
             return (
@@ -152,7 +155,7 @@ class TractionFit(eqx.Module):
     def number_intervals(self, coverage: float = 0.95) -> dict[str, tuple[float, float]]:
         """Compute intervals that hold fitted numbers with the probability asked for, by name."""
         half = float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * coverage))
-        spread = dict(zip(self.misfit.parameters, jnp.sqrt(jnp.diag(self.number_covariance())), strict=True))
+        spread = dict(zip(self.misfit.parameters, jnp.sqrt(jnp.diag(self.number_covariance)), strict=True))
         white = self.posterior.white.numbers
         return {
             name: tuple(float(prior.number(white[name] + sign * half * spread[name])) for sign in (-1.0, 1.0))
@@ -171,21 +174,6 @@ class TractionFit(eqx.Module):
         values = self.numbers
         parts = {n: 0.5 * (high - low) / abs(float(values[n])) for n, (low, high) in self.number_intervals().items()}
         return {name: part for name, part in parts.items() if part > within}
-
-    def number_covariance(self) -> Float[Array, "numbers numbers"]:
-        """Compute the posterior covariance of the fitted numbers' white unknowns, each of variance 1 before the fit."""
-        names = list(self.misfit.parameters)
-        if not names:
-            return jnp.zeros((0, 0))
-        nothing = jax.tree.map(jnp.zeros_like, self.posterior.white)
-
-        def column(one):
-            weights = nothing._replace(numbers={name: one[i] for i, name in enumerate(names)})
-            pulled = self.posterior.covariance(weights).numbers
-            return jnp.stack([pulled[name] for name in names])
-
-        columns = jnp.stack([column(one) for one in jnp.eye(len(names))])
-        return 0.5 * (columns + columns.T)
 
     def draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n *maps my mx"]:
         """Draw normal tractions from the posterior [MPa].
@@ -233,7 +221,7 @@ class TractionFit(eqx.Module):
                 if penalised and after > _NOT_OBSERVED * before:
                     found[label] = (float(after), float(before))
         if self.misfit.parameters:
-            variances, directions = np.linalg.eigh(np.asarray(self.number_covariance()))
+            variances, directions = np.linalg.eigh(np.asarray(self.number_covariance))
             for variance, direction in zip(variances, directions.T, strict=True):
                 if (after := np.sqrt(variance)) > _NOT_OBSERVED:
                     found[_direction_name(list(self.misfit.parameters), direction)] = (float(after), 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.hyperparameters import most_likely, rescaled
+from opfem.inverse.hyperparameters import most_likely, next_factor, rescaled
 
 SHAPE = (21, 21)
 
@@ -52,6 +52,16 @@ def test_total_variation_has_no_likelihood(fit):
         ValueError, match=r'needs Matern\(\.\.\.\) or Tikhonov\(\.\.\.\), got TotalVariation.*"discrepancy"'
     ):
         most_likely.__wrapped__(prior, samples(op.Matern(0.7, 2e-3), fit), fit)
+
+
+@pytest.mark.parametrize("root", [-3.0, -1.0, 0.5, 3.0])
+def test_discrepancy_is_found_in_few_fits(root):
+    """χ² that falls with the fourth power of a small standard deviation, ever less of a large one, to a floor."""
+    tried, factor = [], 0.0
+    for _ in range(7):
+        tried.append((factor, 4.0 * np.log(np.tanh(1.0)) - 4.0 * np.log(np.tanh(np.exp(factor - root)))))
+        factor = next_factor(tried)
+    assert factor == pytest.approx(root, abs=0.02)
 
 
 @pytest.mark.parametrize("prior", [op.Matern(0.7, 2e-3), op.Tikhonov(2, 300.0)])

@@ -169,6 +169,34 @@ def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
 
 
 @pytest.mark.slow
+def test_taylor_remainders_fall_with_the_order_of_the_derivatives_taken_away():
+    """VALIDATION.md test 37, second derivatives included: halving the step divides remainders by 2, 4 and 8."""
+    solve, numbers = CASES["traction on a bonded layer"]
+
+    @jax.jit
+    def derivatives(numbers, direction):
+        def along(t):
+            return measure(solve({name: value + t * direction[name] for name, value in numbers.items()}))
+
+        def slope(t):
+            return jax.jvp(along, (t,), (1.0,))
+
+        (value, first), (_, second) = jax.jvp(slope, (0.0,), (1.0,))
+        return value, first, second
+
+    for number, start in numbers.items():
+        change = relative(numbers, 3)[number] if np.ndim(start) else start
+        direction = {name: np.zeros(np.shape(other)) for name, other in numbers.items()} | {number: change}
+        value, first, second = derivatives(numbers, direction)
+        remainders = []
+        for t in (0.005, 0.0025):
+            off = measure(solve({**numbers, number: start + t * change})) - value
+            remainders.append([off, off - t * first, off - t * first - 0.5 * t**2 * second])
+        slopes = np.log2(np.abs(remainders[0]) / np.abs(remainders[1]))
+        assert np.all(slopes > [0.95, 1.95, 2.95]), (number, slopes, remainders)
+
+
+@pytest.mark.slow
 def test_vmap_over_four_materials_equals_the_loop_and_jit_equals_eager():
     numbers = CASES["displacement on a spring"].numbers
 
