@@ -4,9 +4,9 @@ Run `python -m benchmarks.traction_fit CASE`, CASE one of
 
 - `truth`: data from quadratic tetrahedra on a mesh 1.8 times finer, not nested, friction on both sides, 2 µm noise;
   the fit beside the imprint route, the linear and the uniaxial estimate;
-- `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3] [--once] [--coarse]`: Jacobian products, with and without
-  preconditioner, and the whole fit in forward solves; 0 leaves a mask out; each fit twice, the second time nothing is
-  compiled, or once; from the linear estimate or from a fit on half of the elements;
+- `cost [--elements 20 40 80] [--missing 0.3] [--block 0.3] [--once] [--increments 8]`: Jacobian products, with and
+  without preconditioner, and the whole fit in forward solves; 0 leaves a mask out; each fit twice, the second time
+  nothing is compiled, or once;
 - `coin MAP [--elements 40] [--model-std 4] [--out FILE.png]`: the published coin beside its imprint, also with the
   imprint's lateral traction; and a map simulated from a draw of its posterior, beside that;
 - `coverage [--fits 400] [--first 0] [--believed 1]`: truths drawn from the prior on 12 × 12 × 2, one functional each;
@@ -18,7 +18,6 @@ Each prints JSON lines.
 """
 
 import argparse
-import dataclasses
 import json
 import sys
 import time
@@ -148,7 +147,7 @@ def prior_field(experiment: op.Palpation, prior: op.Matern, seed: int) -> jnp.nd
     return prior.mean + prior.expand(jax.random.normal(jax.random.key(seed), mesh.thickness.shape), mesh.spacing)
 
 
-def cost_case(elements: list[int], missing: float, block: float, times: int, coarse: bool) -> None:
+def cost_case(elements: list[int], missing: float, block: float, times: int, increments: int) -> None:
     """Count products with the Jacobian, on maps of the fit's own model."""
     compiling: list[float] = []
     monitoring.register_event_duration_secs_listener(
@@ -158,7 +157,7 @@ def cost_case(elements: list[int], missing: float, block: float, times: int, coa
         palpation = experiment((n, n, max(2, n // 10)), n * ELEMENT)
         prior = op.Matern(length=0.6, std=1.5e-3, mean=3e-3)
         truth = prior_field(palpation, prior, seed=5)
-        settings = op.Newton(max_path=12)  # those of the fit; the first solve compiles
+        settings = op.Newton(increments=increments, max_path=increments + 4)  # of solve and fit
         solution = op.solve(palpation, op.Traction(truth), settings)
         heights = surface(palpation, solution, 4 * n + 1)
         rng = np.random.default_rng(2)
@@ -176,8 +175,7 @@ def cost_case(elements: list[int], missing: float, block: float, times: int, coa
             for _ in range(times):
                 compiling.clear()
                 begin = time.perf_counter()
-                start = coarse_fit(palpation, measured, prior) if coarse else None
-                fit = op.fit_traction(palpation, measured, prior, start=start, draws=2)
+                fit = op.fit_traction(palpation, measured, prior, solver=settings, draws=2)
                 seconds.append(round(time.perf_counter() - begin, 1))
                 compile_seconds.append(round(sum(compiling), 1))
             begin = time.perf_counter()
@@ -189,6 +187,7 @@ def cost_case(elements: list[int], missing: float, block: float, times: int, coa
             whole = int(fit.stats["forward_solves"]) + int(fit.stats["inner_iterations"]) * products / forward
             row = {
                 "elements": palpation.elements,
+                "increments": increments,
                 "missing": name,
                 "fit": error(fit.normal, truth),
                 "reduced_chi2": round(float(fit.reduced_chi2), 3),
@@ -202,12 +201,6 @@ def cost_case(elements: list[int], missing: float, block: float, times: int, coa
                 **counts(fit),
             }
             print(json.dumps(row), flush=True)
-
-
-def coarse_fit(palpation: op.Palpation, measured: op.ThicknessMap, prior: op.Matern) -> jnp.ndarray:
-    """Fit on half of the elements, allowing 3 µm for what they miss: a traction to start from [MPa]."""
-    half = dataclasses.replace(palpation, elements=tuple(n // 2 for n in palpation.elements))
-    return op.fit_traction(half, measured, prior, model_std=3e-3, rtol=3e-2, draws=1).normal
 
 
 def unpreconditioned(fit: op.TractionFit) -> int:
@@ -460,7 +453,7 @@ def main() -> None:
     parser.add_argument("--missing", type=float, default=0.3)
     parser.add_argument("--block", type=float, default=0.3)
     parser.add_argument("--once", action="store_true")
-    parser.add_argument("--coarse", action="store_true")
+    parser.add_argument("--increments", type=int, default=8, help="load increments of `cost`")
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument(
@@ -478,7 +471,7 @@ def main() -> None:
     if chosen.case == "truth":
         truth_case()
     elif chosen.case == "cost":
-        cost_case(chosen.elements, chosen.missing, chosen.block, 1 if chosen.once else 2, chosen.coarse)
+        cost_case(chosen.elements, chosen.missing, chosen.block, 1 if chosen.once else 2, chosen.increments)
     elif chosen.case == "coin":
         for n in chosen.elements:
             coin_case(chosen.map, n, 1e-3 * chosen.model_std, chosen.out)
