@@ -1,7 +1,7 @@
 """`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from ..model import Contact, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
-from .bed import lay_bed, no_bed
+from .bed import Bed, lay_bed, no_bed
 from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
@@ -75,6 +75,7 @@ def fit_traction(
 
     Least squares over misfit and priors, by Gauss–Newton through the nonlinear solve with its friction history. The
     normal traction is fitted; the lateral one follows the sample's friction (`Traction`) unless `lateral` is given.
+    The layer is pressed by springs near an imprint of the map, so that friction remembers the way of an imprint.
 
     Args:
         palpation: The experiment; its sample a `Contact`, its elements hexahedra.
@@ -97,8 +98,8 @@ def fit_traction(
             the map is what its noise makes it, the strongest prior that the data allow. "evidence": standard deviation
             and length so that the data are most likely (Laplace).
         start: Normal traction to start from [MPa], interface nodes `(ny+1, nx+1)` of this mesh or of a coarser one,
-            such as the `normal` of a fit that takes minutes less; of each map where there are several. None: the
-            linear estimate.
+            such as the `normal` of a fit that takes minutes less; of each map where there are several. None: that
+            of an imprint of the map or, where the layer does not take it, the linear estimate.
         solver: Settings of the forward solve; `max_path` bounds its increments.
         rtol: The fit has settled where the next step would change the residuals by less, over their norm [-]: about
             what is left to go over the posterior's standard deviations.
@@ -139,21 +140,8 @@ def fit_traction(
     key = jax.random.key(0) if key is None else key
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
-        reached = run.fit(from_estimate(misfit) if start is None else from_normal(start, misfit))
-        bed = lay_bed(misfit.bed, palpation, observations, solver) if _failed(reached) and not nonnegative else None
-        if bed is not None:
-            # The layer snaps on its way under a dead load: hold it, and start from the imprint.
-            run.misfit = eqx.tree_at(lambda m: m.bed, misfit, bed)
-            reached = run.fit(misfit.white(bed.normal))
-            if not _failed(reached) and not bool(_pressed(reached, palpation)):
-                # Off its window, the layer rests on the springs alone.
-                reached = reached._replace(result=FitStatus.not_carried)
-        ended = reached.result
-        near = (ended == FitStatus.max_steps_reached) | ((ended == FitStatus.stalled) & (bed is not None))
-        if _failed(reached) and not bool(near) and prior.mean is not None:
-            # The start pulls and presses harder than the layer takes: start from what the prior expects.
-            run.misfit = misfit
-            reached = run.fit(jax.tree.map(jnp.zeros_like, reached.white))
+        bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
+        reached = _settle(run, bed, start)
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and _failed(reached):
@@ -236,6 +224,31 @@ def _status(state: Any, aux: dict[str, Array], done: Array) -> FitStatus:
     if done:
         return FitStatus.successful
     return FitStatus.stalled if state.search_state.step_size < _LEAST_PART else FitStatus.max_steps_reached
+
+
+def _ways(misfit: Misfit, bed: Bed | None, start: ArrayLike | None) -> Iterator[tuple[Bed, Unknowns]]:
+    """Go through what a fit may rest on and start from, the most promising first."""
+    given = None if start is None else from_normal(start, misfit)
+    if bed is not None:
+        yield bed, misfit.white(bed.normal) if given is None else given
+    yield misfit.bed, from_estimate(misfit) if given is None else given
+    if misfit.prior.mean is not None:
+        # The estimate pulls and presses harder than the layer takes: start from what the prior expects.
+        yield misfit.bed, jax.tree.map(jnp.zeros_like, misfit.white(misfit.observations.surface))
+
+
+def _settle(run: _Run, bed: Bed | None, start: ArrayLike | None) -> _Reached:
+    """Fit on springs, if there are any; where that fails under a dead load."""
+    misfit = run.misfit
+    for used, white in _ways(misfit, bed, start):
+        run.misfit = eqx.tree_at(lambda m: m.bed, misfit, used)
+        reached = run.fit(white)
+        if not _failed(reached) and used is bed and not bool(_pressed(reached, misfit.palpation)):
+            # Off its window, the layer rests on the springs alone.
+            reached = reached._replace(result=FitStatus.not_carried)
+        if not _failed(reached) or bool(reached.result == FitStatus.max_steps_reached):
+            break
+    return reached
 
 
 def _misfit(white: Unknowns, misfit: Misfit):

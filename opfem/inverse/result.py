@@ -58,9 +58,9 @@ class TractionFit(eqx.Module):
     """The traction fitted to a measured map, or to several: arrays then have a leading axis, one entry per map.
 
     Attributes:
-        solution: The layer under the fitted traction, solved to the solver's own tolerance. Its load is a dead one or,
-            where the layer would snap on its way under that, pressed by springs (`Traction.stiffness`): `traction` is
-            what the layer carries.
+        solution: The layer under the fitted traction, solved to the solver's own tolerance. Its load is pressed by
+            springs (`Traction.stiffness`), near an imprint of the map, so that the layer does not snap on its way; a
+            dead one where springs do not do. `traction` is what the layer carries either way.
         pressure_std: Posterior standard deviation of `pressure`, on the current area [MPa].
         normal_std: The same of the normal traction, per reference area [MPa].
         chi2: Sum of squared misfits between interface and measured surface over their noise, of all maps [-].
