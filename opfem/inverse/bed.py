@@ -6,6 +6,8 @@ the interface about as small-strain elasticity says, so that a fit settles in ha
 do is known: the traction which the layer carries in the end, and not the load behind them, is what is fitted.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from ..measurement import ThicknessMap
 from ..model import Imprint, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.solution import is_failure
-from .observation import Nodes, Observation
+from .observation import Observation
 from .preconditioner import fit_normal, indentation
 from .prior import AbstractPrior
 
@@ -24,6 +26,10 @@ from .prior import AbstractPrior
 # without springs 92 in 13. The coin, whose misfit jumps, takes 30 to 40 solves at 20 and at 75; at 7.5 inner
 # iterations become too many.
 _STIFFNESS = 20.0
+# A node of the surface counts as measured where this part of its pixels does.
+_TOLD = 0.3
+# Least height of an imprint over the layer's thickness, and the increments tried before it is given up.
+_LEAST, _MOST_ATTEMPTS = 0.05, 200
 
 
 class Bed(eqx.Module):
@@ -64,7 +70,9 @@ def no_bed(palpation: Palpation, observations: Observation, prior: AbstractPrior
 
 def lay_bed(bed: Bed, palpation: Palpation, observations: Observation, solver: Newton) -> Bed | None:
     """Stiffen a bed, at rest about imprints of the maps; None where the layer does not take the imprint."""
-    solutions = [_imprint(palpation, surface, solver) for surface in observations.surface]
+    maps = observations.surface.shape[0]
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], observations) for i in range(maps)]
+    solutions = [_imprint(palpation, observation, solver) for observation in each]
     if any(bool(is_failure(solution.result)) for solution in solutions):
         return None
     stiffness = _STIFFNESS * palpation.layer.material.shear / jnp.mean(palpation.mesh().thickness)
@@ -73,6 +81,12 @@ def lay_bed(bed: Bed, palpation: Palpation, observations: Observation, solver: N
     return Bed(stiffness, normal, uz, bed.gain, bed.softness)
 
 
-def _imprint(palpation: Palpation, surface: Nodes, solver: Newton) -> Solution:
-    imprint = Imprint(ThicknessMap(surface, extent=palpation.extent))
-    return solve(palpation, imprint, solver, throw=False, progress=False)
+def _imprint(palpation: Palpation, observation: Observation, solver: Newton) -> Solution:
+    # Where few pixels count, splines run away: filled in from around.
+    rows, columns = jnp.abs(observation.to_rows).T, jnp.abs(observation.to_columns)
+    counted = rows @ (observation.certainty > 0) @ columns
+    told = counted >= _TOLD * (jnp.sum(rows, axis=1)[:, None] * jnp.sum(columns, axis=0))
+    least = _LEAST * jnp.mean(palpation.mesh().thickness)
+    surface = ThicknessMap(jnp.maximum(observation.surface, least), extent=palpation.extent, mask=~told)
+    few = dataclasses.replace(solver, max_increments=min(solver.max_increments, _MOST_ATTEMPTS))
+    return solve(palpation, Imprint(surface.filled()), few, throw=False, progress=False)

@@ -12,9 +12,10 @@ import pytest
 
 import opfem as op
 import opfem.inverse.fit
+from opfem.inverse.bed import lay_bed, no_bed
 from opfem.inverse.forward import press
 from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
-from opfem.inverse.observation import _spline_values, interface_heights
+from opfem.inverse.observation import _spline_values, interface_heights, observe
 from opfem.inverse.start import on_mesh
 from opfem.mechanics.face import tributary_area
 from opfem.solvers.derivative import follow_path
@@ -258,6 +259,20 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
             functional(*(a + s * h * d for a, d in zip(at, direction, strict=True)))[0] for s in (1.0, -1.0)
         )
         assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-4)
+
+
+def test_springs_where_a_corner_was_not_measured():
+    """Splines run away there: the imprint that springs are laid about must not."""
+    experiment, mask = palpation((6, 6, 2)), np.zeros((31, 31), bool)
+    mask[:17, :17] = True
+    y, x = np.mgrid[0:1:31j, 0:1:31j]
+    pressed = 0.5 - 0.9 * np.maximum(0.55 - np.maximum(x, y) / 1.2, 0.0)
+    thickness = op.ThicknessMap(pressed, extent=(SIDE, SIDE), std=NOISE, mask=mask)
+    observation = jax.tree.map(lambda leaf: leaf[None], observe(experiment.mesh(), thickness, NOISE))
+    assert observation.surface.min() < -1.0
+    bed = lay_bed(no_bed(experiment, observation, op.Matern(0.6, 1e-3)), experiment, observation, op.Newton())
+    assert bed is not None
+    assert jnp.all(bed.uz > -0.3)
 
 
 @pytest.mark.slow
