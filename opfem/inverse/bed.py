@@ -2,7 +2,7 @@
 
 Under a dead load a layer moves far where it slips and opens, and as sharp a load as a coin's makes it snap: maps are
 far from linear in it. Springs between the load and the layer hold every node on its way: what is asked for then moves
-the interface about as small-strain elasticity says, so that a fit settles in half of the steps or less. What springs
+the interface about as small-strain elasticity says, so that most fits settle in half of the steps or less. What springs
 do is known: the traction which the layer carries in the end, and not the load behind them, is what is fitted.
 """
 

@@ -140,8 +140,9 @@ def fit_traction(
     key = jax.random.key(0) if key is None else key
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
+        given = None if start is None else from_normal(start, misfit)
         bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
-        reached = _settle(run, bed, start)
+        reached = _settle(run, bed, given)
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and _failed(reached):
@@ -226,9 +227,8 @@ def _status(state: Any, aux: dict[str, Array], done: Array) -> FitStatus:
     return FitStatus.stalled if state.search_state.step_size < _LEAST_PART else FitStatus.max_steps_reached
 
 
-def _ways(misfit: Misfit, bed: Bed | None, start: ArrayLike | None) -> Iterator[tuple[Bed, Unknowns]]:
+def _ways(misfit: Misfit, bed: Bed | None, given: Unknowns | None) -> Iterator[tuple[Bed, Unknowns]]:
     """Go through what a fit may rest on and start from, the most promising first."""
-    given = None if start is None else from_normal(start, misfit)
     if bed is not None:
         yield bed, misfit.white(bed.normal) if given is None else given
     yield misfit.bed, from_estimate(misfit) if given is None else given
@@ -237,10 +237,10 @@ def _ways(misfit: Misfit, bed: Bed | None, start: ArrayLike | None) -> Iterator[
         yield misfit.bed, jax.tree.map(jnp.zeros_like, misfit.white(misfit.observations.surface))
 
 
-def _settle(run: _Run, bed: Bed | None, start: ArrayLike | None) -> _Reached:
+def _settle(run: _Run, bed: Bed | None, given: Unknowns | None) -> _Reached:
     """Fit on springs, if there are any; where that fails under a dead load."""
     misfit = run.misfit
-    for used, white in _ways(misfit, bed, start):
+    for used, white in _ways(misfit, bed, given):
         run.misfit = eqx.tree_at(lambda m: m.bed, misfit, used)
         reached = run.fit(white)
         if not _failed(reached) and used is bed and not bool(_pressed(reached, misfit.palpation)):
