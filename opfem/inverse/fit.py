@@ -19,10 +19,10 @@ from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .bed import Bed, lay_bed, no_bed
 from .data import AxialDisplacement, ForceReading
-from .gauss_newton import GaussNewton, Interpolating, Learnt, PreconditionedDescent
+from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
-from .misfit import Misfit, carried, moved, number_covariance, pressure_change, stops
+from .misfit import Misfit, carried, moved, number_covariance, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
 from .posterior import MOST_ITERATIONS, Posterior
@@ -45,8 +45,6 @@ _PRESSED = 1e-4
 _LEAST_PART = 5e-3
 # A non-negative pressure bends towards zero below this part of the shear modulus.
 _SOFTNESS = 0.05
-# Change of the residuals over their norm below which a fit is near its optimum: then a jump of the misfit counts.
-_NEAR = 0.3
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
 _MOST_CHOICES = 8
 _CHOSEN = 0.05
@@ -138,7 +136,6 @@ def fit_traction(
         softness=_SOFTNESS * palpation.layer.material.shear if nonnegative else None,
         bed=no_bed(palpation, observations, prior),
         solver=solver.as_leaves(),
-        stops=jnp.tile(solver.as_leaves().stops, (len(maps), 1)),
     )
     key = jax.random.key(0) if key is None else key
     with FitProgress(progress) as bar:
@@ -198,37 +195,30 @@ class _Run:
             jnp.asarray(_CG_NEGLIGIBLE),
             jnp.asarray(misfit.hopeless),
         )
-        gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent, Interpolating(_increments))
+        gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
         state = _begin(gauss_newton, white, misfit)
-        result = FitStatus.max_steps_reached
+        result, aux = FitStatus.max_steps_reached, None
         for _ in range(self.max_steps):
-            white, state, done = _step(gauss_newton, white, misfit, state)
+            white, state, aux, done = _step(gauss_newton, white, misfit, state)
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
             self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
-            result = _status(state, done)
-            self.misfit = misfit = _repeating(misfit, stops(state.f_info.residual))
+            result = _status(state, aux, done)
             if result != FitStatus.max_steps_reached:
                 break
-            seen = stops(state.search_state.seen)
-            finer = jnp.sum(seen < 1.0, axis=1) > jnp.sum(misfit.stops < 1.0, axis=1)
-            if state.descent_state.change < _NEAR and jnp.any(finer):
-                # Refused, perhaps only as it was cut back: linearise anew with its increments.
-                self.misfit = misfit = _repeating(misfit, jnp.where(finer[:, None], seen, misfit.stops))
-                state = eqx.tree_at(lambda s: (s.y_eval, s.first_step), state, (white, jnp.asarray(True)))
         self.iterations += int(state.descent_state.iterations)
         self.steps += int(state.num_accepted_steps)
         J = state.f_info.jac
         inverse = Learnt(eqx.filter_jit(descent.precondition)(J), state.descent_state.iterated)
         posterior = Posterior(white, J, inverse)
-        return _Reached(white, state.f_info.residual, state.aux, posterior, result)
+        return _Reached(white, state.f_info.residual, aux, posterior, result)
 
 
-def _status(state: Any, done: Array) -> FitStatus:
+def _status(state: Any, aux: dict[str, Array], done: Array) -> FitStatus:
     """Tell how a fit has ended; `max_steps_reached` if it has not."""
-    if not jnp.all(state.aux["followed"]):
+    if not jnp.all(aux["followed"]):
         return FitStatus.too_many_increments
-    if not jnp.all(state.aux["carried"]):
+    if not jnp.all(aux["carried"]):
         return FitStatus.not_carried
     if not all(jnp.all(jnp.isfinite(v)) for v in (state.f_info.as_min(), *jax.tree.leaves(state.y_eval))):
         return FitStatus.nonfinite
@@ -265,14 +255,6 @@ def _misfit(white: Unknowns, misfit: Misfit):
     return misfit(white)
 
 
-def _repeating(misfit: Misfit, increments: Float[Array, "maps n"]) -> Misfit:
-    return eqx.tree_at(lambda m: m.stops, misfit, increments)
-
-
-def _increments(residuals: dict[str, Any]) -> dict[str, Any]:
-    return {"stops": residuals["stops"]}
-
-
 _observe = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
 
 
@@ -285,9 +267,9 @@ def _begin(solver, white, misfit):
 
 @eqx.filter_jit
 def _step(solver, white, misfit, state):
-    white, state, _ = solver.step(_misfit, white, misfit, {}, state, frozenset())
+    white, state, aux = solver.step(_misfit, white, misfit, {}, state, frozenset())
     done, _ = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
-    return white, state, done
+    return white, state, aux, done
 
 
 def _draw(posterior: Posterior, key: PRNGKeyArray):
@@ -325,8 +307,8 @@ def _result(
     misfit = run.misfit
     palpation, loads = misfit.experiment(reached.white), misfit.tractions(reached.white)
     solutions = [
-        solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.stopping(at), throw=False, progress=False)
-        for i, at in enumerate(misfit.stops)
+        solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
+        for i in range(loads.normal.shape[0])
     ]
     deviations, moves, whites, dof, iterations, cut_short = [], [], [], [], 0, 0
     for count, one in enumerate(jax.random.split(key, draws)):

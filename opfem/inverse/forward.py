@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
@@ -19,14 +18,14 @@ class Pressed(NamedTuple):
     Attributes:
         u: Displacement of its nodes [mm].
         reached: Load fraction that the solve reached [-].
-        stops: Load fractions of its increments, 1 beyond: `Newton.stops` that repeat it; all 1 where it failed [-].
+        newton: Newton steps taken.
         followed: Whether its derivative follows all increments. The solve ends where they are more than
             `Newton.max_path`, those on the way through a snap included: a snap that long counts as not carried.
     """
 
     u: Float[Array, "3 mz my mx"]
     reached: Array
-    stops: Float[Array, " n"]
+    newton: Array
     followed: Array
 
 
@@ -50,7 +49,4 @@ def press(palpation: Palpation, load: Traction, solver: Newton, exact: bool = Fa
     end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
     through = follow_path if exact else linearise_path
     _, state = through(problem, start.state, end.path, end.kept, settings)
-    stops = end.fractions[: solver.max_path]
-    followed = end.kept <= solver.max_path
-    stops = jnp.where(jnp.isnan(stops) | (end.state.fraction < 1.0) | ~followed, 1.0, stops)
-    return Pressed(state.u, end.state.fraction, stops, followed)
+    return Pressed(state.u, end.state.fraction, end.newton, end.kept <= solver.max_path)

@@ -268,7 +268,6 @@ class PreconditionedDescent(optx.AbstractDescent):
 class _Search(eqx.Module):
     step_size: Array
     change: Array  # `_Direction.change`
-    seen: Any  # of the residuals at the point looked at last, accepted or not
 
 
 class Interpolating(optx.AbstractSearch):
@@ -280,23 +279,16 @@ class Interpolating(optx.AbstractSearch):
 
     The sum of squares jumps where a forward solve cuts an increment back: friction remembers another path. A point that
     a jump put lower than its surroundings would never be left, so the shortest steps may rise a little.
-
-    Attributes:
-        notice: What to take from the residuals wherever the search looks, for the state's `seen`.
     """
-
-    notice: Callable = eqx.field(static=True, default=lambda residual: None)
 
     def init(self, y, f_info_struct):
         """Start with whole steps."""
-        del y
-        seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), self.notice(f_info_struct.residual))
-        return _Search(jnp.ones(()), jnp.zeros(()), seen)
+        del y, f_info_struct
+        return _Search(jnp.ones(()), jnp.zeros(()))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         """Accept a point that is no worse, and not far beyond the least of the parabola through it; or one close by."""
         del y, y_eval
-        seen = self.notice(f_eval_info.residual)
         length, before, now = state.step_size, f_info.as_min(), f_eval_info.as_min()
         fall = state.change**2 * before  # that a whole step promises; the slope is twice it
         curvature = (now - before + 2.0 * fall * length) / length**2
@@ -306,7 +298,7 @@ class Interpolating(optx.AbstractSearch):
         accept = first_step | lower | close
         shorter = jnp.clip(least, _SHORTEST * length, _LONGEST * length)
         length = jnp.where(accept, jnp.where(lower, jnp.minimum(least, 1.0), 1.0), shorter)
-        return length, accept, optx.RESULTS.successful, _Search(length, state.change, seen)
+        return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 
 class GaussNewton(optx.AbstractGaussNewton):

@@ -21,8 +21,8 @@ from .prior import AbstractPrior, on_nodes
 
 # Standardised misfit [-] of every pixel where the layer does not carry the traction: the step is then shortened.
 _NOT_CARRIED = 1e4
-# Weight of displacements [1/mm], tractions [1/MPa] and load fractions [-] that ride along among the residuals, so that
-# products with the Jacobian give their change too, and a search sees them: it weighs nothing.
+# Weight of displacements [1/mm] and tractions [1/MPa] that ride along among the residuals, so that products with the
+# Jacobian give their change too: it weighs nothing.
 _RIDES_ALONG = 1e-9
 
 
@@ -41,8 +41,6 @@ class Misfit(eqx.Module):
         softness: Pressure [MPa] below which a non-negative traction bends towards zero; None: any sign.
         bed: Springs between the load and the layer; of stiffness 0 for a dead load.
         solver: Settings of the forward solve.
-        stops: `Newton.stops` of the solve under each map [-]. An increment that is cut back makes the misfit jump, as
-            friction remembers another path; increments that are the same from point to point do not.
     """
 
     palpation: Palpation
@@ -56,7 +54,6 @@ class Misfit(eqx.Module):
     softness: Array | None
     bed: Bed
     solver: Newton
-    stops: Float[Array, "maps n"]
 
     @property
     def hopeless(self) -> float:
@@ -98,10 +95,6 @@ class Misfit(eqx.Module):
         numbers = {name: jnp.zeros(()) for name in self.parameters}
         return Unknowns(jax.vmap(lambda part: self.prior.whiten(part, spacing))(deviation), lateral, numbers)
 
-    def stopping(self, stops: Float[Array, " n"]) -> Newton:
-        """Set where the increments of a solve end."""
-        return eqx.tree_at(lambda settings: settings.stops, self.solver, stops)
-
     def tractions(self, white: Unknowns) -> Traction:
         """Compute the load of every map, stacked."""
         dead, stiffness = self.bed.load(self.asked(white)), self.bed.stiffness
@@ -124,14 +117,14 @@ class Misfit(eqx.Module):
         mesh, spacing = palpation.mesh(), palpation.mesh().spacing
 
         def one(each):
-            observation, load, stops = each
-            pressed = press(palpation, load, self.stopping(stops), exact)
+            observation, load = each
+            pressed = press(palpation, load, self.solver, exact)
             heights = interface_heights(mesh, pressed.u[:, -1]) * numbers.get(INDEX, 1.0)
             misfit = jnp.where(pressed.reached >= 1.0, observation.misfit(heights), _NOT_CARRIED)
             return misfit, heights, pressed
 
         loads = self.tractions(white)
-        misfit, heights, pressed = _one_by_one(one, (self.observations, loads, self.stops))
+        misfit, heights, pressed = _one_by_one(one, (self.observations, loads))
         normal = self.bed.carried(loads.normal, pressed.u[:, 2, -1])
         # Springs add to what is asked for.
         added = jax.vmap(lambda part: self.prior.whiten(part, spacing))(normal - self.asked(white))
@@ -141,7 +134,6 @@ class Misfit(eqx.Module):
             "numbers": white.numbers,
             "moved": _RIDES_ALONG * pressed.u[:, :, -1],
             "normal": _RIDES_ALONG * normal,
-            "stops": _RIDES_ALONG * pressed.stops,
         }
         if self.lateral is not None:
             prior = self.lateral
@@ -191,11 +183,6 @@ def moved(residuals: dict[str, Any]) -> Float[Array, "maps 3 my mx"]:
 def carried(residuals: dict[str, Any]) -> Float[Array, "maps my mx"]:
     """Take the normal traction that the layer carries, or its change [MPa], from residuals or their change."""
     return residuals["normal"] / _RIDES_ALONG
-
-
-def stops(residuals: dict[str, Any]) -> Float[Array, "maps n"]:
-    """Take the load fractions at which increments ended [-] from residuals."""
-    return residuals["stops"] / _RIDES_ALONG
 
 
 def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:

@@ -5,13 +5,12 @@ Displacement and contact pressure are unknowns together, the pressure eliminated
 moves of single nodes that stand out, and is taken whole unless an element would invert.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from .._checks import check_positive
 from ..mechanics.boundary import Bodies
@@ -53,7 +52,6 @@ class Newton(eqx.Module):
             times the mean move: a corner that slips over a ridge must not take its neighbours along.
         max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
             solve keeps as many displacement fields. Beyond, derivatives are NaN.
-        stops: Load fractions [-] on the way that increments do not pass, ascending, at most `max_path`; None: none.
         face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
             sample of exact hard contact, always at the nodes.
 
@@ -69,16 +67,13 @@ class Newton(eqx.Module):
     krylov_steps: float | int | Array = 120
     max_backtracks: float | int | Array = 6
     step_limit: float | int | Array = 0.025
-    stops: ArrayLike | None = None
     max_increments: int = eqx.field(static=True, default=1500)
     max_path: int = eqx.field(static=True, default=64)
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
 
     def as_leaves(self) -> "Newton":
         """Make every number an array, so that another value compiles nothing anew."""
-        given = jnp.ones(0) if self.stops is None else jnp.asarray(self.stops, float)
-        stops = jnp.ones(self.max_path).at[: given.shape[0]].set(given)
-        return dataclasses.replace(jax.tree.map(jnp.asarray, self), stops=stops)
+        return jax.tree.map(jnp.asarray, self)
 
     def __check_init__(self):
         for name in (

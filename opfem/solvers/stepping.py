@@ -147,8 +147,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     """Try one load increment, or one solve of a snap; keep it if it converges, else return to the last state."""
     full = 1.0 / settings.increments
     left = 1.0 - s.state.fraction
-    to_stop = _next_stop(settings, s.state.fraction) - s.state.fraction
-    increment = jnp.where(to_stop < 1.01 * s.increment, to_stop, s.increment)
+    increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
     fraction = s.state.fraction + increment
     held = (s.state.held & ~(s.can_release & ~s.release_failed)) | s.release_failed
     snapping = (s.viscosity > 0) | (s.origin.fraction > s.state.fraction)
@@ -214,12 +213,6 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         length=length,
         kept=jnp.where(accepted, length, s.kept),
     )
-
-
-def _next_stop(settings: Newton, fraction: Array) -> Array:
-    """Find the load fraction that the next increment may not pass."""
-    ahead = settings.stops > fraction + 0.5 * settings.min_increment
-    return jnp.min(jnp.where(ahead, settings.stops, 1.0), initial=1.0)
 
 
 def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:

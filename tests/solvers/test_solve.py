@@ -168,23 +168,6 @@ def test_cut_back_restores_the_state_and_equals_asking_for_the_smaller_increment
     np.testing.assert_array_equal(after_cut.state.histories.window.elastic, asked.state.histories.window.elastic)
 
 
-def test_stops_repeat_a_solve_that_was_cut_back():
-    from opfem.solvers.solve import _prepare, _run_with_progress
-
-    def run(stops):
-        settings = op.Newton(increments=1, max_steps=5, stops=stops).as_leaves()
-        return _run_with_progress(
-            *_prepare(palpation(), op.Imprint(bumpy()), None, settings, None, False), settings, False
-        )
-
-    cut = run(None)
-    increments = int(cut.increments)
-    assert int(cut.attempts) > increments > 1
-    again = run(cut.fractions[:increments])
-    assert int(again.attempts) == int(again.increments) == increments
-    np.testing.assert_allclose(again.state.u, cut.state.u, atol=1e-12)
-
-
 def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
     """Without friction the path does not count, so the viscous medium must lead to the state of a direct solve."""
     from opfem.solvers.solve import _attempt, _prepare
