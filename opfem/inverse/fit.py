@@ -197,13 +197,13 @@ class _Run:
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
         state = _begin(gauss_newton, white, misfit)
-        result, aux = FitStatus.max_steps_reached, None
+        result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):
-            white, state, aux, done = _step(gauss_newton, white, misfit, state)
+            white, state, done = _step(gauss_newton, white, misfit, state)
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
             self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
-            result = _status(state, aux, done)
+            result = _status(state, done)
             if result != FitStatus.max_steps_reached:
                 break
         self.iterations += int(state.descent_state.iterations)
@@ -211,14 +211,14 @@ class _Run:
         J = state.f_info.jac
         inverse = Learnt(eqx.filter_jit(descent.precondition)(J), state.descent_state.iterated)
         posterior = Posterior(white, J, inverse)
-        return _Reached(white, state.f_info.residual, aux, posterior, result)
+        return _Reached(white, state.f_info.residual, state.aux, posterior, result)
 
 
-def _status(state: Any, aux: dict[str, Array], done: Array) -> FitStatus:
+def _status(state: Any, done: Array) -> FitStatus:
     """Tell how a fit has ended; `max_steps_reached` if it has not."""
-    if not jnp.all(aux["followed"]):
+    if not jnp.all(state.aux["followed"]):
         return FitStatus.too_many_increments
-    if not jnp.all(aux["carried"]):
+    if not jnp.all(state.aux["carried"]):
         return FitStatus.not_carried
     if not all(jnp.all(jnp.isfinite(v)) for v in (state.f_info.as_min(), *jax.tree.leaves(state.y_eval))):
         return FitStatus.nonfinite
@@ -267,9 +267,10 @@ def _begin(solver, white, misfit):
 
 @eqx.filter_jit
 def _step(solver, white, misfit, state):
-    white, state, aux = solver.step(_misfit, white, misfit, {}, state, frozenset())
+    # The auxiliary output that comes back is that of the point before.
+    white, state, _ = solver.step(_misfit, white, misfit, {}, state, frozenset())
     done, _ = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
-    return white, state, aux, done
+    return white, state, done
 
 
 def _draw(posterior: Posterior, key: PRNGKeyArray):

@@ -100,6 +100,9 @@ def test_fit_knows_how_well_it_did(fit, truth):
     assert 0.5 * fit.observed < fit.effective_dof < fit.observed
     assert fit.stats["misfit_rms"] < 0.5 * NOISE
     assert fit.stats["representation_rms"] == pytest.approx(NOISE, rel=0.05)
+    # The residual is that of the traction which is returned.
+    heights = interface_heights(palpation().mesh(), fit.solution.displacement[:, -1])
+    np.testing.assert_allclose(fit.residual, heights - fit.misfit.observations.surface[0], atol=0.01 * NOISE)
 
 
 @pytest.mark.slow
