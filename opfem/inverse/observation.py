@@ -21,7 +21,7 @@ _PER_FWHM = 1.0 / np.sqrt(8.0 * np.log(2.0))
 # Stiffness of the splines between pixels, over the mean precision of a node: what masked nodes follow.
 _BENDING = 1e-6
 # Steps to find which point of the interface lies at a place. The first go half of the way that is left, which comes
-# near unless a fibre is stretched to four times its length (1.7 times at a side that bulges); as many follow by Newton's
+# near unless fibres are four times as long as they were (1.7 times at a side that bulges); as many follow by Newton's
 # method, for which the interface counts as folded where it covers less than this part of its area.
 _LOCATING_STEPS = 20
 _FOLDED = 1e-3
@@ -132,26 +132,31 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
     moved, height = (spline(u[0]), spline(u[1])), spline(mesh.thickness + u[2])
     frozen = jax.lax.stop_gradient(moved)
 
-    def remaining(at, fields):
+    def newton(at, fields, counts):
+        """Say what is left of the way, and the step that Newton's method takes along the axes that count."""
         values, slope_x, slope_y = (jnp.stack(part) for part in zip(*(field(*at) for field in fields), strict=True))
-        return place - at - values, jax.lax.stop_gradient((slope_x, slope_y))
-
-    def newton(off, slopes):
-        (a, c), (b, d) = slopes
+        off = place - at - values
+        counted = jax.lax.stop_gradient(counts(at, off))
+        off = jnp.where(counted, off, 0.0)
+        (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(counted, slope, 0.0)) for slope in (slope_x, slope_y))
         determinant = (1.0 + a) * (1.0 + d) - b * c
         determinant = jnp.where(determinant > _FOLDED, determinant, 1.0)
-        return jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
+        return off, jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
+
+    def on_layer(at, off):
+        return ((at > 0.0) | (off > 0.0)) & ((at < far) | (off < 0.0))
+
+    def found(_, off):
+        return jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None]
 
     def closer(count, at):
-        off, slopes = remaining(at, frozen)
-        return jnp.clip(at + jnp.where(count < _LOCATING_STEPS, 0.5 * off, newton(off, slopes)), 0.0, far)
+        off, step = newton(at, frozen, on_layer)
+        return jnp.clip(at + jnp.where(count < _LOCATING_STEPS, 0.5 * off, step), 0.0, far)
 
     at = jax.lax.fori_loop(0, 2 * _LOCATING_STEPS, closer, place)
     # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
     for _ in range(2):
-        off, slopes = remaining(at, moved)
-        found = jax.lax.stop_gradient(jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None])
-        at = at + newton(jnp.where(found, off, 0.0), jax.tree.map(lambda slope: jnp.where(found, slope, 0.0), slopes))
+        at = at + newton(at, moved, found)[1]
     return height(*at)[0]
 
 

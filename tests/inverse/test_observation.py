@@ -117,9 +117,9 @@ def test_interface_is_seen_at_deformed_places(mesh):
     assert interface_heights(mesh, u)[inner] == pytest.approx(np.asarray(surface(x, y))[inner], abs=1e-5)
 
 
-@pytest.mark.parametrize("bulge", [0.0, 0.2])
+@pytest.mark.parametrize("bulge", [0.0, 0.5])
 def test_interface_derivatives(mesh, bulge):
-    """Also where a side bulges so that its fibres are nearly twice as long (0.2 mm over 0.25 mm)."""
+    """Also where a side bulges so that its fibres are nearly twice as long as they were."""
     x, y = mesh.plane()
     u = jnp.stack([0.1 * jnp.sin(x), 0.05 * jnp.cos(y) - bulge * jnp.exp(-y / 0.25), surface(x, y) - 0.5])
     change = 0.01 * jax.random.normal(jax.random.key(0), u.shape)
