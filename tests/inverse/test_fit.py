@@ -449,9 +449,9 @@ def looked_along(misfit):
     solver = GaussNewton(rtol, rtol, descent)
     state = solver.init(followed, y := jnp.zeros(3), None, {}, *jax.eval_shape(followed, y, None), frozenset())
     for _ in range(6):
-        y, state, aux = solver.step(followed, y, None, {}, state, frozenset())
+        y, state, _ = solver.step(followed, y, None, {}, state, frozenset())
         done, _ = solver.terminate(followed, y, None, {}, state, frozenset())
-        status = opfem.inverse.fit._status(state, aux, done)
+        status = opfem.inverse.fit._status(state, done)
         if status != op.FitStatus.max_steps_reached:
             break
     return y, status
