@@ -62,19 +62,20 @@ def apply_stencil(S: PartStencil, u: PartNodal) -> PartNodal:
 
 
 def _product(S: PartStencil, u: PartNodal) -> PartNodal:
-    shape = u.shape[1:]
+    components, shape = len(u), u.shape[1:]
     along_z, along_y, nodes = shape[1] * shape[2], shape[2], int(np.prod(shape))
     furthest = along_z + along_y + 1
-    components = len(u)
-    padded = [jnp.pad(row, furthest) for row in jax.lax.split(u.reshape(-1), [nodes] * components)]
-    blocks = iter(jax.lax.split(S.reshape(-1), [nodes] * (27 * components**2)))
-    rows = [jnp.zeros(nodes, jnp.result_type(S, u))] * components
-    for dz, dy, dx in itertools.product(range(3), repeat=3):
-        shift = dz * along_z + dy * along_y + dx
-        neighbour = [jax.lax.slice(row, [shift], [shift + nodes]) for row in padded]
-        for i, j in itertools.product(range(components), repeat=2):
-            rows[i] = rows[i] + next(blocks) * neighbour[j]
-    return jnp.stack(rows).reshape(u.shape)
+    padded = jnp.pad(u.reshape(components, nodes), ((0, 0), (furthest, furthest)))
+    blocks = S.reshape(27, components, components, nodes)
+    # All pairs of components at once: a third of the memory traffic more would be the sum over j within the loop of
+    # neighbours; single rows are four times as many instructions to compile.
+    shifts = [
+        dz * along_z + dy * along_y + dx for dz, dy, dx in itertools.product(range(3), repeat=3)
+    ]
+    neighbours = (jax.lax.slice_in_dim(padded, shift, shift + nodes, axis=1) for shift in shifts)
+    products = [block * neighbour for block, neighbour in zip(blocks, neighbours, strict=True)]
+    pairs = sum(products[1:], start=products[0])
+    return sum((pairs[:, j] for j in range(1, components)), start=pairs[:, 0]).reshape(u.shape)
 
 
 def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
