@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..mechanics.hex8 import pad_axis
 from ..mechanics.staging import apart
 from .stencil import (
     ElementMatrices,
@@ -255,22 +256,23 @@ def _coarsen_mask(free: np.ndarray) -> np.ndarray:
 
 def _prolong(v: Array, shape: tuple[int, ...]) -> Array:
     for axis in _coarsened_axes(shape):
-        v = _along(v, _interpolation(shape[axis]), axis)
-    return v
+        low, high = _without_end(v, axis, 0), _without_end(v, axis, 1)
+        pairs = jnp.stack([low, 0.5 * (low + high)], axis=v.ndim + axis + 1)
+        doubled = list(v.shape)
+        doubled[axis] = 2 * (v.shape[axis] - 1)
+        last = jax.lax.slice_in_dim(v, v.shape[axis] - 1, None, axis=v.ndim + axis)
+        v = jnp.concatenate([pairs.reshape(doubled), last], axis=axis)
+    return v[..., : shape[-2], : shape[-1]]
 
 
 def _restrict(r: Array) -> Array:
     for axis in _coarsened_axes(r.shape):
-        r = _along(r, _interpolation(r.shape[axis]).T, axis)
+        reach = r.shape[axis] // 2 * 2 + 1  # of the coarse nodes, the last perhaps beyond the end
+        r = pad_axis(r, axis, (1, reach + 1 - r.shape[axis]))
+        before, at, after = (jax.lax.slice_in_dim(r, k, k + reach, 2, r.ndim + axis) for k in range(3))
+        r = at + 0.5 * (before + after)
     return r
 
 
-def _interpolation(n: int) -> np.ndarray:
-    """Build the matrix of linear interpolation to n nodes from every other one, the last perhaps beyond the end."""
-    return np.maximum(0.0, 1.0 - 0.5 * np.abs(np.arange(n)[:, None] - 2 * np.arange(n // 2 + 1)))
-
-
-def _along(values: Array, matrix: np.ndarray, axis: int) -> Array:
-    """Multiply a matrix with the values along one axis."""
-    product = jnp.tensordot(jnp.asarray(matrix, values.dtype), values, (1, values.ndim + axis))
-    return jnp.moveaxis(product, 0, axis)
+def _without_end(v: Array, axis: int, start: int) -> Array:
+    return jax.lax.slice_in_dim(v, start, start + v.shape[axis] - 1, axis=v.ndim + axis)
