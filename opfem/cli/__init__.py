@@ -6,12 +6,10 @@ It reads, solves and writes with the same public functions as a notebook, and sa
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from ..compilation import cache_compilation
 from ..datasets import COIN_LAYER, coin_file
 from ..io import Checkpoint, write_thickness
 from ..measurement import ThicknessMap
@@ -22,6 +20,7 @@ from .options import ContactOptions, LayerOptions, MapOptions, RunOptions
 from .running import (
     FINISHED,
     app,
+    configure_jax,
     main as main,
     prepare,
     refuse_finished,
@@ -61,9 +60,7 @@ def palpate(
         run: The run itself.
     """
     with reporting(run.debug):
-        jax.config.update("jax_enable_x64", True)
-        if run.keep_compiled:
-            cache_compilation()
+        configure_jax(run.no_cache)
         refuse_finished(out, run.force)
         measured, unloaded = read_maps(map, reading)
         palpation, load = state_experiment(measured, unloaded, reading, layer, contact)

@@ -5,20 +5,18 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import jax.numpy as jnp
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from ..compilation import cache_compilation
 from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
 from ..model import Palpation
 from ..results import summary, to_xarray
 from ..solvers import Newton
 from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions
-from .running import FINISHED, app, prepare, refuse_finished, reporting, write_files
+from .running import FINISHED, app, configure_jax, prepare, refuse_finished, reporting, write_files
 from .statement import read_maps, settings_of, show_assumptions, state_experiment
 
 FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", FINISHED)
@@ -52,9 +50,7 @@ def fit(
         run: The run itself.
     """
     with reporting(run.debug):
-        jax.config.update("jax_enable_x64", True)
-        if run.keep_compiled:
-            cache_compilation()
+        configure_jax(run.no_cache)
         refuse_finished(out, run.force)
         if run.solver != "newton":
             raise ValueError("opfem fit differentiates the implicit solver; leave out --solver explicit.")
