@@ -15,6 +15,7 @@ from ..io import Checkpoint, write_thickness
 from ..measurement import ThicknessMap
 from ..results import summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, Explicit, Newton, Solution, solve
+from ..solvers.progress import Progress
 from .fit import fit as fit
 from .options import ContactOptions, LayerOptions, MapOptions, RunOptions
 from .running import (
@@ -60,22 +61,24 @@ def palpate(
         run: The run itself.
     """
     with reporting(run.debug):
-        configure_jax(run.no_cache)
-        refuse_finished(out, run.force)
-        measured, unloaded = read_maps(map, reading)
-        palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
-        settings = settings_of(map, reading, layer, contact, load)
-        prepare(out)
-        if map == "example":
-            write_thickness(measured, out / "example_map.npz")
-        show_assumptions(palpation, load.thickness, layer, contact)
-        try:
-            solution = solve(palpation, load, _solver(run))
-        except ConvergenceError as failure:
-            remove(out, FILES)
-            write_summary({**summary(failure.solution), "settings": settings}, out)
-            raise
-        write_results(solution, measured, settings, out)
+        with Progress(True, at_once=True) as progress:
+            progress.stage("reading")
+            configure_jax(run.no_cache)
+            refuse_finished(out, run.force)
+            measured, unloaded = read_maps(map, reading)
+            palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
+            settings = settings_of(map, reading, layer, contact, load)
+            prepare(out)
+            if map == "example":
+                write_thickness(measured, out / "example_map.npz")
+            show_assumptions(palpation, load.thickness, layer, contact)
+            try:
+                solution = solve(palpation, load, _solver(run))
+            except ConvergenceError as failure:
+                remove(out, FILES)
+                write_summary({**summary(failure.solution), "settings": settings}, out)
+                raise
+            write_results(solution, measured, settings, out, progress)
         _show_results(solution, out)
 
 
@@ -100,7 +103,9 @@ def demo(
     palpate(str(path), out=out, reading=MapOptions(l0=str(COIN_LAYER), extent=(5.0, 5.0)), run=run)
 
 
-def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path) -> None:
+def write_results(
+    solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path, progress: Progress
+) -> None:
     """Write every file of a result.
 
     Args:
@@ -108,13 +113,17 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
         measured: Loaded thickness as measured, for the report.
         settings: What the user asked for, for summary.json.
         out: Folder of the results.
+        progress: Where to say so.
     """
+    progress.stage("pictures")
     # Loaded here, so that the help and a refused run do not wait for matplotlib.
     from ..plot import draw_pictures
 
     dataset = to_xarray(solution)
     numbers = {**summary(solution), "settings": settings}
-    write_files(dataset, draw_pictures(dataset, measured), numbers, FILES, out)
+    figures = draw_pictures(dataset, measured)
+    progress.stage("writing")
+    write_files(dataset, figures, numbers, FILES, out)
 
 
 def _solver(options: RunOptions) -> Newton | Explicit:

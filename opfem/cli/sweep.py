@@ -21,6 +21,7 @@ from .. import sweep as computation
 from ..datasets import coin_file
 from ..model import Palpation
 from ..solvers import Newton, Solution, solve
+from ..solvers.progress import Progress
 from ..sweep import Batch, sample, zip_
 from ..sweep.design import Points, grid, known_name
 from ..sweep.outputs import GOOD
@@ -90,16 +91,18 @@ def sweep(
         debug: Whether to show tracebacks.
     """
     with reporting(debug):
-        configure_jax(no_cache)
-        stated = _read(config)
-        _settle_folder(out, resume, force)
-        points = _points(stated["axes"], stated.get("design", {}))
-        keep = stated["outputs"]["keep"]
-        if not (isinstance(keep, list) and keep and all(isinstance(name, str) for name in keep)):
-            raise ValueError(f"[outputs] keep must be a list of names, got {keep!r}.")
-        function = _function(_inputs(stated["inputs"], points, config.parent), tuple(points.columns))
-        execution = Batch(**stated.get("execution", {}))
-        data = computation(function, points, keep=keep, execution=execution, out=out)
+        with Progress(True, at_once=True) as progress:
+            progress.stage("reading")
+            configure_jax(no_cache)
+            stated = _read(config)
+            _settle_folder(out, resume, force)
+            points = _points(stated["axes"], stated.get("design", {}))
+            keep = stated["outputs"]["keep"]
+            if not (isinstance(keep, list) and keep and all(isinstance(name, str) for name in keep)):
+                raise ValueError(f"[outputs] keep must be a list of names, got {keep!r}.")
+            function = _function(_inputs(stated["inputs"], points, config.parent), tuple(points.columns))
+            execution = Batch(**stated.get("execution", {}))
+            data = computation(function, points, keep=keep, execution=execution, out=out)
         failed = int(np.sum(~np.isin(data.status, GOOD)))
         console = Console(highlight=False)
         console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
