@@ -67,7 +67,7 @@ def cache_compilation(folder: str | os.PathLike | None = None, *, gigabytes: flo
 
 def silence_alarm() -> None:
     """Switch off what XLA logs while it compiles slowly; what goes wrong in XLA reaches Python as an exception."""
-    former = jax.config.jax_logging_level
+    former = _option("jax_logging_level")
     if former in (None, "NOTSET") and "TF_CPP_MIN_LOG_LEVEL" not in os.environ:
         # The level of jaxlib's C++ log outlasts the second update, that of Python's does not.
         jax.config.update("jax_logging_level", "CRITICAL")
@@ -76,16 +76,20 @@ def silence_alarm() -> None:
 
 def configuration() -> dict[str, Any]:
     """Return how JAX is configured here, for `configure` in another process."""
-    kept = jax.config.jax_compilation_cache_dir
-    return {"jax_enable_x64": jax.config.jax_enable_x64, "root": None if kept is None else str(Path(kept).parent)}
+    kept = _option("jax_compilation_cache_dir")
+    return {"jax_enable_x64": _option("jax_enable_x64"), "root": None if kept is None else str(Path(kept).parent)}
 
 
 def configure(settings: dict[str, Any]) -> None:
     """Configure JAX as another process has it; each machine keeps what it compiled in its own folder."""
-    if jax.config.jax_enable_x64 != settings["jax_enable_x64"]:
+    if _option("jax_enable_x64") != settings["jax_enable_x64"]:
         jax.config.update("jax_enable_x64", settings["jax_enable_x64"])
     if settings["root"] is not None:
         cache_compilation(settings["root"])
+
+
+def _option(name: str) -> Any:
+    return getattr(jax.config, name)
 
 
 def _root(folder: str | os.PathLike | None) -> Path:
@@ -150,7 +154,7 @@ def _translated(show: Callable) -> Callable:
         report = _REPORT.match(str(message))
         if report is None:
             return show(message, category, filename, lineno, file, line)
-        folder = Path(jax.config.jax_compilation_cache_dir or "")
+        folder = Path(_option("jax_compilation_cache_dir") or "")
         doing, program, cause = report.groups()
         _drop_damaged(folder, program)
         if doing == "writing":

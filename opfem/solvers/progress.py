@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedCol
 _TICK = 0.25  # [s] between looks at what XLA does and how late it is
 _EVERY = 8.0  # [s] between lines of a log: none is silent for 10 s
 _PATIENCE = 5.0  # [s] that a stage of a library call takes before a log hears of it
-_NOTABLE = 1.0  # [s] of one compilation before it is mentioned
+_NOTABLE = 2.0  # [s] of one compilation before it is mentioned; one that is kept on disk is read in less
 
 # Compilations under way, by thread: when each began.
 _COMPILING: dict[int, float] = {}
@@ -28,7 +28,7 @@ class _Now(NamedTuple):
 
     text: str = "starting"
     fraction: float | None = None
-    compiles: float | None = None  # [s], typically, the first time
+    compiles: str | None = None
     stage: int = 0
     since: float = 0.0
 
@@ -75,12 +75,12 @@ class Progress:
         else:
             self._display.put(self._former)
 
-    def stage(self, text: str, *, compiles: float | None = None) -> None:
+    def stage(self, text: str, *, compiles: str | None = None) -> None:
         """Begin a stage.
 
         Args:
             text: What is done, in a word or two.
-            compiles: How long its programs typically compile [s].
+            compiles: What is compiled and for how long, to be said when that takes long.
         """
         if self._display is not None:
             self._display.begin(text, compiles)
@@ -121,7 +121,7 @@ class _Display:
         self._watch = threading.Thread(target=context.run, args=(self._keep_up,), name="opfem progress", daemon=True)
         self._watch.start()
 
-    def begin(self, text: str, compiles: float | None) -> None:
+    def begin(self, text: str, compiles: str | None) -> None:
         """Begin a stage."""
         self._count += 1
         self.put(_Now(text, None, compiles, self._count, self._time()))
@@ -150,7 +150,8 @@ class _Display:
         now, time = self.now, self._time()
         text = now.text
         if compiling:
-            text += ": compiling" + ("" if now.compiles is None else f", about {now.compiles:.0f} s the first time")
+            verb = "still compiling" if self._said == (now.stage, True) else "compiling"
+            text = f"{text}: {verb}" if now.compiles is None else f"{verb} {now.compiles}"
         if self._bar is not None:
             # A total of None, without an end, cannot be given to update; at an end the clock would stop.
             self._bar.tasks[0].total = None if now.fraction is None else 1.0

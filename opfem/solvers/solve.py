@@ -19,8 +19,8 @@ from .recover import recover
 from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
-# What the programs of a solve typically take to compile [s], whatever the mesh.
-_COMPILES = 20
+# Compiling takes as long whatever the mesh.
+_COMPILES = "the solver, about 20 s the first time"
 
 
 def solve(

@@ -26,8 +26,8 @@ from .store import FINISHED, Folder, Memory, Outcome
 from .table import table
 
 Execution = Batch | Devices | Cluster
-# What a solve that can be differentiated typically takes to compile [s], whatever the mesh.
-_COMPILES = 30
+# Compiling takes as long whatever the mesh.
+_COMPILES = "the solver of the sweep, about half a minute the first time"
 
 
 def sweep(
