@@ -1,6 +1,7 @@
 """Compiled programs on disk, and what may go wrong with them."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -16,7 +17,11 @@ import opfem as op
 from opfem import compilation
 
 ROOT = Path(__file__).resolve().parents[1]
-OPTIONS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+OPTIONS = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_enable_xla_caches",
+)
 ANSWER = 1.0969782335466
 
 
@@ -54,6 +59,10 @@ def test_a_program_compiled_after_others_is_kept_and_found_again(tmp_path, capfd
     assert kept
     assert program() == pytest.approx(ANSWER)
     assert kept == entries(folder)
+    copied = op.cache_compilation(shutil.copytree(tmp_path / "new", tmp_path / "elsewhere"))
+    assert copied is not None
+    assert program() == pytest.approx(ANSWER)
+    assert {path.name for path in entries(copied)} == {path.name for path in kept}
     assert capfd.readouterr().err == ""
 
 

@@ -78,7 +78,7 @@ def palpate(
                 remove(out, FILES)
                 write_summary({**summary(failure.solution), "settings": settings}, out)
                 raise
-            write_results(solution, measured, settings, out, progress)
+            write_results(solution, measured, settings, out)
         _show_results(solution, out)
 
 
@@ -103,9 +103,7 @@ def demo(
     palpate(str(path), out=out, reading=MapOptions(l0=str(COIN_LAYER), extent=(5.0, 5.0)), run=run)
 
 
-def write_results(
-    solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path, progress: Progress
-) -> None:
+def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path) -> None:
     """Write every file of a result.
 
     Args:
@@ -113,17 +111,17 @@ def write_results(
         measured: Loaded thickness as measured, for the report.
         settings: What the user asked for, for summary.json.
         out: Folder of the results.
-        progress: Where to say so.
     """
-    progress.stage("pictures")
-    # Loaded here, so that the help and a refused run do not wait for matplotlib.
-    from ..plot import draw_pictures
+    with Progress(True, at_once=True) as progress:
+        progress.stage("pictures")
+        # Loaded here, so that the help and a refused run do not wait for matplotlib.
+        from ..plot import draw_pictures
 
-    dataset = to_xarray(solution)
-    numbers = {**summary(solution), "settings": settings}
-    figures = draw_pictures(dataset, measured)
-    progress.stage("writing")
-    write_files(dataset, figures, numbers, FILES, out)
+        dataset = to_xarray(solution)
+        numbers = {**summary(solution), "settings": settings}
+        figures = draw_pictures(dataset, measured)
+        progress.stage("writing")
+        write_files(dataset, figures, numbers, FILES, out)
 
 
 def _solver(options: RunOptions) -> Newton | Explicit:

@@ -107,7 +107,10 @@ class _Display:
         self._patience = 0.0 if at_once else _PATIENCE
         self._count = 0
         self._said: tuple[int, bool] = (0, False)  # the stage of the last line, and whether it said "compiling"
-        self._bar = self._handle = None
+        self._bar: Bar | None = None
+        self._handle: Any = None
+        self._written = ""
+        self._lock = threading.Lock()
         if console.is_jupyter:
             self._handle = _notebook_line()
         elif console.is_interactive:
@@ -140,7 +143,7 @@ class _Display:
         if self._bar is not None:
             self._bar.stop()
         if self._handle is not None:
-            self._handle.update(_text(""))
+            self._write("")
 
     def _keep_up(self) -> None:
         while not self._ended.wait(_TICK):
@@ -157,15 +160,22 @@ class _Display:
             self._bar.tasks[0].total = None if now.fraction is None else 1.0
             self._bar.update(self._task, description=text, completed=min(now.fraction or 0.0, 0.999))
         elif self._handle is not None:
-            self._handle.update(_text(f"{text} ({time - self._begin:.0f} s)"))
+            self._write(f"{text} ({time - self._begin:.0f} s)")
         else:
             self._log(text, (now.stage, compiling or self._said == (now.stage, True)), time - now.since, time)
 
     def _log(self, text: str, state: tuple[int, bool], age: float, time: float) -> None:
-        if (state > self._said and age >= self._patience) or time - self._last >= max(_EVERY, self._patience):
-            self._said, self._last = state, time
-            line = f"opfem {time - self._begin:4.0f} s  {text}"
-            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        with self._lock:
+            news = state > self._said and age >= self._patience
+            if news or time - self._last >= max(_EVERY, self._patience):
+                self._said, self._last = max(state, self._said), time
+                line = f"opfem {time - self._begin:4.0f} s  {text}"
+                self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def _write(self, line: str) -> None:
+        if line != self._written:
+            self._written = line
+            self._handle.update(_text(line))
 
     def _time(self) -> float:
         return self._console.get_time()
