@@ -59,7 +59,7 @@ def cache_compilation(folder: str | os.PathLike | None = None, *, gigabytes: flo
         return None
     jax.config.update("jax_compilation_cache_dir", str(own))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING if _writable(own) else _NEVER)
-    # Else the path would be part of what an entry is found by, and a folder that was moved or copied would be of no use.
+    # Else the path would be part of the key of each entry, and a folder that was moved or copied would be of no use.
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     compilation_cache.reset_cache()  # else what was compiled before this call would have settled that there is none
     if not getattr(warnings.showwarning, "of_cache", False):

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedCol
 _TICK = 0.25  # [s] between looks at what XLA does and how late it is
 _EVERY = 8.0  # [s] between lines of a log: none is silent for 10 s
 _PATIENCE = 5.0  # [s] that a stage of a library call takes before a log hears of it
-_NOTABLE = 2.0  # [s] of one compilation before it is mentioned; one that is kept on disk is read in less
+_NOTABLE = 3.0  # [s] of one compilation before it is mentioned; one that is kept on disk is read in less
 
 # Compilations under way, by thread: when each began.
 _COMPILING: dict[int, float] = {}
@@ -153,8 +153,8 @@ class _Display:
         now, time = self.now, self._time()
         text = now.text
         if compiling:
-            verb = "still compiling" if self._said == (now.stage, True) else "compiling"
-            text = f"{text}: {verb}" if now.compiles is None else f"{verb} {now.compiles}"
+            what = f"compiling {now.compiles}" if now.compiles else f"{text}: compiling"
+            text = f"still {what.partition(',')[0]}" if self._said == (now.stage, True) else what
         if self._bar is not None:
             # A total of None, without an end, cannot be given to update; at an end the clock would stop.
             self._bar.tasks[0].total = None if now.fraction is None else 1.0
