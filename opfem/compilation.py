@@ -54,7 +54,7 @@ def cache_compilation(folder: str | os.PathLike | None = None, *, gigabytes: flo
         own = root / f"jaxlib-{version('jaxlib')}-{_processor()}"
         own.mkdir(parents=True, exist_ok=True)
         _prune(root, int(1e9 * gigabytes))
-    except OSError as cause:
+    except (OSError, RuntimeError) as cause:  # platformdirs raises the latter where there is no home folder
         _say(f"compiled programs are not kept: {cause}")
         return None
     jax.config.update("jax_compilation_cache_dir", str(own))
@@ -70,7 +70,8 @@ def cache_compilation(folder: str | os.PathLike | None = None, *, gigabytes: flo
 def silence_alarm() -> None:
     """Switch off what XLA logs while it compiles slowly; what goes wrong in XLA reaches Python as an exception."""
     former = _option("jax_logging_level")
-    if former in (None, "NOTSET") and "TF_CPP_MIN_LOG_LEVEL" not in os.environ:
+    # JAX itself sets the variable to 1.
+    if former in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
         # The level of jaxlib's C++ log outlasts the second update, that of Python's does not.
         jax.config.update("jax_logging_level", "CRITICAL")
         jax.config.update("jax_logging_level", former)

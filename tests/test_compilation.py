@@ -99,6 +99,12 @@ def test_the_users_cache_is_the_default_and_the_environment_overrides_it(tmp_pat
     assert op.cache_compilation() is None
     assert "no home folder" in capfd.readouterr().err
 
+    def homeless(project):
+        raise RuntimeError("could not determine the home directory")  # as platformdirs does
+
+    monkeypatch.setattr("pooch.os_cache", homeless)
+    assert op.cache_compilation() is None
+
 
 @pytest.mark.usefixtures("settings_restored")
 def test_a_folder_that_cannot_be_made_costs_one_line(tmp_path, capfd):
@@ -170,3 +176,23 @@ def test_processes_share_a_folder_and_a_full_disk_costs_one_line(tmp_path):
     assert entries(tmp_path / "a")
     assert all(compilation._is_whole(path) for path in entries(tmp_path / "a"))
     assert not entries(tmp_path / "b")
+
+
+ALARM = """
+import sys
+import jax, numpy as np
+from opfem.compilation import silence_alarm
+for k in range(2):
+    constant = np.random.rand(40, 1000) + k  # folded while it compiles, for some seconds
+    jax.jit(lambda: jax.lax.reduce_window(constant, 0.0, jax.lax.add, (9, 9), (1, 1), "SAME")).lower().compile()
+    print("silent from here on", file=sys.stderr, flush=True)
+    silence_alarm()
+"""
+
+
+@pytest.mark.slow
+def test_the_alarm_of_xla_is_silenced():
+    answer = subprocess.run([sys.executable, "-c", ALARM], cwd=ROOT, capture_output=True, text=True, check=True)
+    before, after, _ = answer.stderr.split("silent from here on\n")
+    assert "Constant folding an instruction is taking" in before
+    assert after == ""
