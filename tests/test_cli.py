@@ -28,6 +28,11 @@ def opfem(*arguments) -> int:
     return end.value.code
 
 
+@pytest.fixture(autouse=True)
+def _cache_of_the_user_is_left_alone(monkeypatch):
+    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
+
+
 @pytest.fixture
 def map_file(tmp_path):
     x, y = np.meshgrid(np.linspace(0.0, 2.0, 21), np.linspace(0.0, 2.0, 17))
@@ -145,6 +150,15 @@ def test_options_arrive(tmp_path, map_file, solved):
     assert solver.increments == 5
     assert load.correct_approach
     assert [step.name for step in load.thickness.steps] == ["read", "filled"]
+
+
+def test_compiled_programs_are_kept_unless_refused(tmp_path, map_file, solved, monkeypatch):
+    asked = []
+    monkeypatch.setattr("opfem.cli.running.cache_compilation", lambda: asked.append(True))
+    assert opfem("palpate", map_file, *SMALL, "--out", tmp_path / "a") == 0
+    assert asked == [True]
+    assert opfem("palpate", map_file, *SMALL, "--out", tmp_path / "b", "--no-cache") == 0
+    assert asked == [True]
 
 
 def test_explicit_solver_arrives(tmp_path, map_file, solved):

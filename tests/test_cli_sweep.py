@@ -33,6 +33,11 @@ def opfem(*arguments) -> int:
     return end.value.code
 
 
+@pytest.fixture(autouse=True)
+def _cache_of_the_user_is_left_alone(monkeypatch):
+    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
+
+
 @pytest.fixture
 def config(tmp_path):
     x, y = np.meshgrid(np.linspace(0.0, 2.0, 21), np.linspace(0.0, 2.0, 17))

@@ -6,22 +6,22 @@ It reads, solves and writes with the same public functions as a notebook, and sa
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from ..compilation import cache_compilation
 from ..datasets import COIN_LAYER, coin_file
 from ..io import Checkpoint, write_thickness
 from ..measurement import ThicknessMap
 from ..results import summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, Explicit, Newton, Solution, solve
+from ..solvers.progress import Progress
 from .fit import fit as fit
 from .options import ContactOptions, LayerOptions, MapOptions, RunOptions
 from .running import (
     FINISHED,
     app,
+    configure_jax,
     main as main,
     prepare,
     refuse_finished,
@@ -61,24 +61,24 @@ def palpate(
         run: The run itself.
     """
     with reporting(run.debug):
-        jax.config.update("jax_enable_x64", True)
-        if run.keep_compiled:
-            cache_compilation()
-        refuse_finished(out, run.force)
-        measured, unloaded = read_maps(map, reading)
-        palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
-        settings = settings_of(map, reading, layer, contact, load)
-        prepare(out)
-        if map == "example":
-            write_thickness(measured, out / "example_map.npz")
-        show_assumptions(palpation, load.thickness, layer, contact)
-        try:
-            solution = solve(palpation, load, _solver(run))
-        except ConvergenceError as failure:
-            remove(out, FILES)
-            write_summary({**summary(failure.solution), "settings": settings}, out)
-            raise
-        write_results(solution, measured, settings, out)
+        with Progress(True, at_once=True) as progress:
+            progress.stage("reading")
+            configure_jax(run.no_cache)
+            refuse_finished(out, run.force)
+            measured, unloaded = read_maps(map, reading)
+            palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
+            settings = settings_of(map, reading, layer, contact, load)
+            prepare(out)
+            if map == "example":
+                write_thickness(measured, out / "example_map.npz")
+            show_assumptions(palpation, load.thickness, layer, contact)
+            try:
+                solution = solve(palpation, load, _solver(run))
+            except ConvergenceError as failure:
+                remove(out, FILES)
+                write_summary({**summary(failure.solution), "settings": settings}, out)
+                raise
+            write_results(solution, measured, settings, out)
         _show_results(solution, out)
 
 
@@ -112,12 +112,16 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
         settings: What the user asked for, for summary.json.
         out: Folder of the results.
     """
-    # Loaded here, so that the help and a refused run do not wait for matplotlib.
-    from ..plot import draw_pictures
+    with Progress(True, at_once=True) as progress:
+        progress.stage("pictures")
+        # Loaded here, so that the help and a refused run do not wait for matplotlib.
+        from ..plot import draw_pictures
 
-    dataset = to_xarray(solution)
-    numbers = {**summary(solution), "settings": settings}
-    write_files(dataset, draw_pictures(dataset, measured), numbers, FILES, out)
+        dataset = to_xarray(solution)
+        numbers = {**summary(solution), "settings": settings}
+        figures = draw_pictures(dataset, measured)
+        progress.stage("writing")
+        write_files(dataset, figures, numbers, FILES, out)
 
 
 def _solver(options: RunOptions) -> Newton | Explicit:

@@ -5,20 +5,19 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import jax.numpy as jnp
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from ..compilation import cache_compilation
 from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
 from ..model import Palpation
 from ..results import summary, to_xarray
 from ..solvers import Newton
+from ..solvers.progress import Progress
 from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions
-from .running import FINISHED, app, prepare, refuse_finished, reporting, write_files
+from .running import FINISHED, app, configure_jax, prepare, refuse_finished, reporting, write_files
 from .statement import read_maps, settings_of, show_assumptions, state_experiment
 
 FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", FINISHED)
@@ -52,41 +51,44 @@ def fit(
         run: The run itself.
     """
     with reporting(run.debug):
-        jax.config.update("jax_enable_x64", True)
-        if run.keep_compiled:
-            cache_compilation()
-        refuse_finished(out, run.force)
-        if run.solver != "newton":
-            raise ValueError("opfem fit differentiates the implicit solver; leave out --solver explicit.")
-        measured, unloaded = read_maps(map, reading)
-        palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
-        prior = state_prior(palpation, load.thickness, asked)
-        settings = {**settings_of(map, reading, layer, contact, load), **_asked(asked, prior)}
-        prepare(out)
-        show_assumptions(palpation, measured, layer, contact)
-        Console(highlight=False).print(
-            f"  prior: pressure {1e3 * float(prior.mean):.3g} ± {1e3 * float(prior.std):.3g} kPa, correlated over "
-            f"{float(prior.length):.3g} mm; noise of the map as given"
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # shown with the results
-            fitted = fit_traction(
-                palpation,
-                measured,
-                prior,
-                parameters=_parameters(palpation, asked),
-                nonnegative=asked.nonnegative,
-                model_std=asked.model_std,
-                hyperparameters=asked.hyperparameters,
-                solver=Newton(max_path=12) if run.increments is None else Newton(increments=run.increments),
-                draws=asked.draws,
+        with Progress(True, at_once=True) as progress:
+            progress.stage("reading")
+            configure_jax(run.no_cache)
+            refuse_finished(out, run.force)
+            if run.solver != "newton":
+                raise ValueError("opfem fit differentiates the implicit solver; leave out --solver explicit.")
+            measured, unloaded = read_maps(map, reading)
+            palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
+            prior = state_prior(palpation, load.thickness, asked)
+            settings = {**settings_of(map, reading, layer, contact, load), **_asked(asked, prior)}
+            prepare(out)
+            show_assumptions(palpation, measured, layer, contact)
+            Console(highlight=False).print(
+                f"  prior: pressure {1e3 * float(prior.mean):.3g} ± {1e3 * float(prior.std):.3g} kPa, correlated over "
+                f"{float(prior.length):.3g} mm; noise of the map as given"
             )
-        numbers = fit_summary(fitted)
-        # Loaded here, so that the help and a refused run do not wait for matplotlib.
-        from ..plot import draw_fit
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", category=UserWarning, module=r"opfem\.")  # shown with the results
+                fitted = fit_traction(
+                    palpation,
+                    measured,
+                    prior,
+                    parameters=_parameters(palpation, asked),
+                    nonnegative=asked.nonnegative,
+                    model_std=asked.model_std,
+                    hyperparameters=asked.hyperparameters,
+                    solver=Newton(max_path=12) if run.increments is None else Newton(increments=run.increments),
+                    draws=asked.draws,
+                )
+            progress.stage("pictures")
+            numbers = fit_summary(fitted)
+            # Loaded here, so that the help and a refused run do not wait for matplotlib.
+            from ..plot import draw_fit
 
-        dataset = to_xarray(fitted)
-        write_files(dataset, draw_fit(dataset, measured), {**numbers, "settings": settings}, FILES, out)
+            dataset = to_xarray(fitted)
+            figures = draw_fit(dataset, measured)
+            progress.stage("writing")
+            write_files(dataset, figures, {**numbers, "settings": settings}, FILES, out)
         _show(numbers, out)
 
 

@@ -12,6 +12,8 @@ from ..model.palpation import Element
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
 _ELEMENTS = (40, 40, 4)
 
+NoCache = Annotated[bool, Parameter(help="Compile anew and keep nothing, as with OPFEM_NO_CACHE=1 in the environment.")]
+
 
 @Parameter(name="*", group=Group("Map", sort_key=1))
 @dataclass(frozen=True)
@@ -130,7 +132,5 @@ class RunOptions:
         Path | None, Parameter(help="File (.npz) that keeps the state of explicit, from which a killed run goes on.")
     ] = None
     force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
-    keep_compiled: Annotated[
-        bool, Parameter(help="Keep what is compiled on disk: later runs of the same mesh need not compile.")
-    ] = False
+    no_cache: NoCache = False
     debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False

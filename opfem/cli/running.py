@@ -11,10 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
 import xarray as xr
 from cyclopts import App, Parameter
 from rich.console import Console
 
+from ..compilation import cache_compilation, silence_alarm
 from ..inverse import FitError
 from ..io import whole_file, write_netcdf, write_vtu
 from ..solvers import ConvergenceError
@@ -89,6 +91,15 @@ def _redelivered_interrupts() -> Iterator[None]:
 
 def _complain(message: str) -> None:
     Console(stderr=True, highlight=False).print(f"opfem: {message}", style="bold red", markup=False, soft_wrap=True)
+
+
+def configure_jax(no_cache: bool) -> None:
+    """Compute in float64, and keep compiled programs for the commands to come."""
+    jax.config.update("jax_enable_x64", True)
+    if no_cache:
+        silence_alarm()
+    else:
+        cache_compilation()
 
 
 def refuse_finished(out: Path, force: bool) -> None:

@@ -12,23 +12,22 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
 from scipy.stats import qmc
 
 from .. import sweep as computation
-from ..compilation import cache_compilation
 from ..datasets import coin_file
 from ..model import Palpation
 from ..solvers import Newton, Solution, solve
+from ..solvers.progress import Progress
 from ..sweep import Batch, sample, zip_
 from ..sweep.design import Points, grid, known_name
 from ..sweep.outputs import GOOD
 from ..sweep.store import FINISHED, PLAN, POINTS
-from .options import ContactOptions, LayerOptions, MapOptions
-from .running import reporting
+from .options import ContactOptions, LayerOptions, MapOptions, NoCache
+from .running import configure_jax, reporting
 from .statement import read_maps, state_experiment
 
 
@@ -76,7 +75,7 @@ def sweep(
     out: Path,
     resume: Annotated[bool, Parameter(help="Go on with the sweep that --out holds.")] = False,
     force: Annotated[bool, Parameter(help="Remove the sweep that --out holds, and begin anew.")] = False,
-    keep_compiled: Annotated[bool, Parameter(help="Keep what is compiled on disk for later runs.")] = False,
+    no_cache: NoCache = False,
     debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False,
 ) -> None:
     """Solve for many values of materials, frictions and thickness, as CONFIG says.
@@ -88,22 +87,22 @@ def sweep(
         out: Folder of the results.
         resume: Whether to go on.
         force: Whether to begin anew.
-        keep_compiled: Whether to keep compiled programs.
+        no_cache: Whether to do without compiled programs on disk.
         debug: Whether to show tracebacks.
     """
     with reporting(debug):
-        jax.config.update("jax_enable_x64", True)
-        if keep_compiled:
-            cache_compilation()
-        stated = _read(config)
-        _settle_folder(out, resume, force)
-        points = _points(stated["axes"], stated.get("design", {}))
-        keep = stated["outputs"]["keep"]
-        if not (isinstance(keep, list) and keep and all(isinstance(name, str) for name in keep)):
-            raise ValueError(f"[outputs] keep must be a list of names, got {keep!r}.")
-        function = _function(_inputs(stated["inputs"], points, config.parent), tuple(points.columns))
-        execution = Batch(**stated.get("execution", {}))
-        data = computation(function, points, keep=keep, execution=execution, out=out)
+        with Progress(True, at_once=True) as progress:
+            progress.stage("reading")
+            configure_jax(no_cache)
+            stated = _read(config)
+            _settle_folder(out, resume, force)
+            points = _points(stated["axes"], stated.get("design", {}))
+            keep = stated["outputs"]["keep"]
+            if not (isinstance(keep, list) and keep and all(isinstance(name, str) for name in keep)):
+                raise ValueError(f"[outputs] keep must be a list of names, got {keep!r}.")
+            function = _function(_inputs(stated["inputs"], points, config.parent), tuple(points.columns))
+            execution = Batch(**stated.get("execution", {}))
+            data = computation(function, points, keep=keep, execution=execution, out=out)
         failed = int(np.sum(~np.isin(data.status, GOOD)))
         console = Console(highlight=False)
         console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)

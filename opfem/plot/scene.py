@@ -21,25 +21,24 @@ def plot_layer(
     stretch_z: float = 3.0,
     vmax: float | None = None,
     cmap: str = "viridis",
+    off_screen: bool = False,
 ) -> "pyvista.Plotter":
     """Put the deformed layer into a 3-D scene, coloured on its top by what the sample does to it [kPa].
 
-    The scene is returned, not shown: call `.show()` on it, or `.screenshot(path)` on one without a window.
+    The scene is returned, not shown: call `.show()` on it, or `.screenshot(path)` on one that is off screen.
 
     Args:
         data: A solution, or its dataset.
-        plotter: Scene to add to; None makes one. `pyvista.Plotter(off_screen=True)` needs no display.
+        plotter: Scene to add to; None makes one.
         colour: "pressure" (contact pressure at the sample) or "stress_zz" (−σ_zz, mean of the top element).
         stretch_z: How much the picture is stretched along the thickness; the scene says so.
         vmax: Upper end of the colours [kPa]; None takes the largest value.
         cmap: Name of the colour map; the default brightens with pressure and so reads in grey.
+        off_screen: Make a scene that needs no display.
 
     Raises:
         ValueError: For a failed solution, or an unknown colour.
     """
-    # Loaded here, so that other pictures do not wait for it.
-    import pyvista
-
     if colour not in ("pressure", "stress_zz"):
         raise ValueError(f'colour must be "pressure" or "stress_zz", got {colour!r}.')
     grid = layer_grid(data if isinstance(data, xr.Dataset) else to_xarray(data))
@@ -52,7 +51,7 @@ def plot_layer(
     values = grid[title]
     limits = (min(0.0, float(_finite(values).min())), float(_finite(values).max()) if vmax is None else vmax)
     # pyvista wraps its methods so that pyright no longer knows them.
-    scene: Any = pyvista.Plotter() if plotter is None else plotter
+    scene: Any = _new_scene(off_screen) if plotter is None else plotter
     scene.add_mesh(
         grid.extract_surface(algorithm="dataset_surface"),
         scalars=title,
@@ -87,6 +86,20 @@ _BAR: Any = {
     "position_y": 0.15,
     "height": 0.7,
 }
+
+
+def _new_scene(off_screen: bool) -> "pyvista.Plotter":
+    """Make a scene, without VTK's warning where it finds no X server and takes other means."""
+    # Loaded here, so that other pictures do not wait for them.
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    try:
+        return pyvista.Plotter(off_screen=off_screen)
+    finally:
+        vtkLogger.SetStderrVerbosity(verbosity)
 
 
 def _finite(values):

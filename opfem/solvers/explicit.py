@@ -24,13 +24,15 @@ from .discretise import discretise
 from .explicit_fields import recover_motion
 from .explicit_history import History, begin_history
 from .explicit_step import Dynamics, Motion, orthonormal_modes, run
-from .progress import LoadProgress
+from .progress import Progress
 from .solution import LastConverged, Solution, is_failure
 
 Amplitude = Literal["smooth_step", "ramp"]
 ELEMENTS = ("mean_dilatation", "full", "reduced", "tet4")
 
 _OUTPUTS = 20
+# Compiling takes as long whatever the mesh.
+_COMPILES = "the explicit solver, about 10 s the first time"
 
 
 @runtime_checkable
@@ -158,18 +160,21 @@ def solve_explicit(
     checkpoint, solver = solver.checkpoint, dataclasses.replace(solver, checkpoint=None)
     leaves = jax.tree.leaves((palpation, load, load_start, first, solver))
     traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-    dynamics, motion = prepare(palpation, load, load_start, solver, first, _may_need_hold(palpation))
-    if traced:
-        if solver.increment == "auto":
-            raise ValueError(
-                'Explicit.increment [s] must be a number inside jit, grad or vmap, got "auto": the count of increments '
-                'must be known. Solve once outside and take 0.9 * solution.stats["increment"].'
-            )
-        motion, history = _run_traced(dynamics, motion, solver)
-    else:
-        keeper = None if checkpoint is None else (checkpoint, (palpation, load, load_start, first, solver))
-        motion, history = _run_on_host(dynamics, motion, solver, keeper, progress)
-    return _finish(dynamics, motion, history, palpation, load, solver)
+    if traced and solver.increment == "auto":
+        raise ValueError(
+            'Explicit.increment [s] must be a number inside jit, grad or vmap, got "auto": the count of increments '
+            'must be known. Solve once outside and take 0.9 * solution.stats["increment"].'
+        )
+    with Progress(progress and not traced) as bar:
+        bar.stage("explicit solver", compiles=_COMPILES)
+        dynamics, motion = prepare(palpation, load, load_start, solver, first, _may_need_hold(palpation))
+        if traced:
+            motion, history = _run_traced(dynamics, motion, solver)
+        else:
+            keeper = None if checkpoint is None else (checkpoint, (palpation, load, load_start, first, solver))
+            motion, history = _run_on_host(dynamics, motion, solver, keeper, bar)
+        bar.stage("fields")
+        return _finish(dynamics, motion, history, palpation, load, solver)
 
 
 @eqx.filter_jit
@@ -276,7 +281,7 @@ _begin_history = eqx.filter_jit(begin_history)
 
 
 def _run_on_host(
-    dynamics: Dynamics, motion: Motion, solver: Explicit, keeper: tuple[Checkpoint, Any] | None, progress: bool
+    dynamics: Dynamics, motion: Motion, solver: Explicit, keeper: tuple[Checkpoint, Any] | None, bar: Progress
 ) -> tuple[Motion, History]:
     """Run output by output; `keeper` is where the state is kept, and the inputs that it belongs to."""
     count = solver.outputs
@@ -284,20 +289,19 @@ def _run_on_host(
     if keeper is not None:
         kept = keeper[0].restore(keeper[1], (motion, history, done))
         motion, history, done = (motion, history, done) if kept is None else kept
-    with LoadProgress(progress) as bar:
-        for k in range(int(done), count):
-            if is_failure(history.status(solver.energy_limit)):
-                break
-            end = solver.duration * (k + 1) / count
-            interval = end - float(motion.time)
-            longest = float(_stable(dynamics, motion, solver)) if solver.increment == "auto" else solver.increment
-            steps = max(1, math.ceil(interval / longest * (1.0 - 1e-9)))
-            motion = _run(dynamics, motion, jnp.asarray(interval / steps), jnp.asarray(steps))
-            motion = eqx.tree_at(lambda m: m.time, motion, jnp.asarray(end, float))
-            history = history.at(k + 1, motion, _energies(dynamics, motion), interval / steps, steps)
-            if keeper is not None:
-                keeper[0].keep(keeper[1], (motion, history, jnp.asarray(k + 1)))
-            bar.show_steps(float(dynamics.fraction(motion.time)), int(history.steps), interval / steps)
+    for k in range(int(done), count):
+        if is_failure(history.status(solver.energy_limit)):
+            break
+        end = solver.duration * (k + 1) / count
+        interval = end - float(motion.time)
+        longest = float(_stable(dynamics, motion, solver)) if solver.increment == "auto" else solver.increment
+        steps = max(1, math.ceil(interval / longest * (1.0 - 1e-9)))
+        motion = _run(dynamics, motion, jnp.asarray(interval / steps), jnp.asarray(steps))
+        motion = eqx.tree_at(lambda m: m.time, motion, jnp.asarray(end, float))
+        history = history.at(k + 1, motion, _energies(dynamics, motion), interval / steps, steps)
+        if keeper is not None:
+            keeper[0].keep(keeper[1], (motion, history, jnp.asarray(k + 1)))
+        bar.show(f"time {100 * (k + 1) / count:.0f} %, {int(history.steps)} increments", (k + 1) / count)
     return motion, history
 
 

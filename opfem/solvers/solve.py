@@ -14,10 +14,13 @@ from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
 from .explicit import Explicit, solve_explicit
 from .newton import Newton
-from .progress import LoadProgress
+from .progress import Progress
 from .recover import recover
 from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure
 from .stepping import Stepping, attempt, begin, outcome, unfinished
+
+# Compiling takes as long whatever the mesh.
+_COMPILES = "the solver, about 20 s the first time"
 
 
 def solve(
@@ -38,7 +41,7 @@ def solve(
         throw: Raise where the solve fails. False: return NaN fields, the status in `result`
             and the last converged state in `last_converged`.
         start: Continue from this solution, with its friction history.
-        progress: Show a bar on a terminal or in a notebook; never inside jit.
+        progress: Say what is done, on a terminal, in a notebook or, where it takes long, on stderr; never inside jit.
 
     Returns:
         The solution. `stats` holds `newton_steps`, `krylov_steps`, `increments`, `attempts`,
@@ -64,12 +67,15 @@ def solve(
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
     traced = _is_traced((palpation, load, load_start, first, solver))
-    problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
     run = _run_differentiable if traced else _run_with_progress
-    stepping = run(problem, initial, solver, progress)
-    if getattr(load, "correct_approach", False):
-        problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, progress)
-    solution = _finish(problem, stepping, palpation, load)
+    with Progress(progress and not traced) as bar:
+        bar.stage("solver", compiles=_COMPILES)
+        problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
+        stepping = run(problem, initial, solver, bar)
+        if getattr(load, "correct_approach", False):
+            problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, bar)
+        bar.stage("fields")
+        solution = _finish(problem, stepping, palpation, load)
     return _raise_on_failure(solution, traced) if throw else solution
 
 
@@ -93,16 +99,15 @@ def _prepare(palpation, load, load_start, solver, state: State | None, traced: b
 _attempt = eqx.filter_jit(attempt)
 
 
-def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
-    with LoadProgress(progress) as bar:
-        while bool(unfinished(stepping)):
-            stepping = _attempt(problem, stepping, solver)
-            s = stepping
-            bar.show(float(s.state.fraction), int(s.attempts), int(s.newton), bool(s.viscosity > 0))
+def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
+    while bool(unfinished(stepping)):
+        stepping = _attempt(problem, stepping, solver)
+        fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.viscosity > 0) else ""
+        bar.show(f"load {100 * fraction:.0f} %, {int(stepping.newton)} Newton steps{snaps}", fraction)
     return stepping
 
 
-def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
+def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     frozen, start, settings = jax.lax.stop_gradient((problem, stepping, solver))
     end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
     assert end.path is not None
@@ -110,7 +115,7 @@ def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, pr
     return end._replace(before=before, state=state, path=None)
 
 
-def _correct_approach(palpation, load, solver, problem, stepping, run, progress) -> tuple[Problem, Stepping]:
+def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> tuple[Problem, Stepping]:
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
         offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
@@ -125,7 +130,7 @@ def _correct_approach(palpation, load, solver, problem, stepping, run, progress)
             can_release=stepping.can_release,
             release_failed=stepping.release_failed,
         )
-        stepping_next = run(shifted, again, solver, progress)
+        stepping_next = run(shifted, again, solver, bar)
         totals = {
             name: getattr(stepping, name) + getattr(stepping_next, name)
             for name in ("attempts", "increments", "newton", "krylov")

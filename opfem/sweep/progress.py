@@ -1,50 +1,30 @@
-"""A progress bar of a sweep: points, rate, failures, time left."""
+"""How far a sweep is: points, rate, failures, time left."""
 
 import time
-from types import TracebackType
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from ..solvers.progress import Progress
 
 
 class SweepProgress:
-    """Shows how far a sweep is on a terminal or in a notebook; silent elsewhere.
+    """Counts the points of a sweep and says how far it is.
 
     Args:
-        wanted: Whether to show anything.
+        shown: Where to say so.
         total: Points of the sweep.
         finished: Points that an earlier run has finished.
     """
 
-    def __init__(self, wanted: bool, total: int, finished: int):
-        console = Console(stderr=True)
-        self._bar = Progress(
-            TextColumn("sweep"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.description}"),
-            console=console,
-            transient=True,
-            disable=not (wanted and (console.is_terminal or console.is_jupyter)),
-        )
-        self._task = self._bar.add_task("compiling", total=total, completed=finished)
+    def __init__(self, shown: Progress, total: int, finished: int):
+        self._shown = shown
         self._total, self._finished, self._done, self._failed = total, finished, 0, 0
         self._begin = time.perf_counter()
-
-    def __enter__(self) -> "SweepProgress":
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
 
     def show(self, done: int, failed: int) -> None:
         """Count points that have just been finished."""
         self._done += done
         self._failed += failed
-        self._bar.update(self._task, completed=self._finished + self._done, description=self.text())
+        reached = self._finished + self._done
+        self._shown.show(f"{reached} of {self._total} points, {self.text()}", reached / self._total)
 
     def text(self) -> str:
         """Say rate, failures and time left; compilation counts as time of the first points."""

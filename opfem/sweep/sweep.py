@@ -14,6 +14,7 @@ import jax
 import xarray as xr
 
 from ..io import write_netcdf
+from ..solvers.progress import Progress
 from .cluster import Cluster
 from .design import Points, check_arguments, grid
 from .execution import Batch, Columns, Devices, Program
@@ -25,6 +26,8 @@ from .store import FINISHED, Folder, Memory, Outcome
 from .table import table
 
 Execution = Batch | Devices | Cluster
+# Compiling takes as long whatever the mesh.
+_COMPILES = "the solver of the sweep, about half a minute the first time"
 
 
 def sweep(
@@ -55,7 +58,7 @@ def sweep(
         execution: `Batch`, `Devices` or `Cluster`.
         out: Folder that keeps every finished point: a sweep that was interrupted goes on where it was when it is
             called again, and ends as if it had not been. None keeps nothing.
-        progress: Show a bar on a terminal or in a notebook.
+        progress: Say how far it is, on a terminal, in a notebook or, where it takes long, on stderr.
 
     Returns:
         Outputs by axes, or by `point` where these form no grid.
@@ -80,16 +83,18 @@ def sweep(
     kept = keep if keep is None or callable(keep) else (keep,) if isinstance(keep, str) else tuple(keep)
     name = getattr(fn, "__name__", "value").replace("<lambda>", "value")
     outputs = Outputs(name, kept, dict(units or {}), tuple(points.columns))
-    store = Memory() if out is None else _open(out, fn, kept, points)
-    plan, program = store.plan, None
-    if plan is None:
-        plan, program = _prepare(fn, outputs, execution, points)
-        store.begin(plan)
-    elif (wanted := execution.plan(plan)) != plan:
-        raise ValueError(
-            f"{out} holds a sweep begun with {plan}, got {wanted}. Go on as it was begun, or choose another out=."
-        )
-    errors = _run(fn, outputs, plan, program, execution, points, store, progress)
+    with Progress(progress, alone=True) as bar:
+        bar.stage("sweep", compiles=_COMPILES)
+        store = Memory() if out is None else _open(out, fn, kept, points)
+        plan, program = store.plan, None
+        if plan is None:
+            plan, program = _prepare(fn, outputs, execution, points)
+            store.begin(plan)
+        elif (wanted := execution.plan(plan)) != plan:
+            raise ValueError(
+                f"{out} holds a sweep begun with {plan}, got {wanted}. Go on as it was begun, or choose another out=."
+            )
+        errors = _run(fn, outputs, plan, program, execution, points, store, bar)
     if len(errors) == len(points):
         raise RuntimeError(f"{name} raised at every point of the sweep; at the first: {errors[0].message}")
     attributes = {
@@ -146,7 +151,7 @@ def _run(
     execution: Execution,
     points: Points,
     store: Memory | Folder,
-    progress: bool,
+    shown: Progress,
 ) -> dict[int, Outcome]:
     """Compute what is missing; return the points where the function raised, which are not kept."""
     batches = [range(i, min(i + plan.points, len(points))) for i in range(0, len(points), plan.points)]
@@ -166,14 +171,14 @@ def _run(
     else:
         program = program or Program(fn, outputs, plan, _columns(points, range(1)))
         finished = execution.run(program, waiting())
-    with SweepProgress(progress, len(points), len(points) - len(missing)) as bar:
-        for batch, outcomes in finished:
-            for i, outcome in zip(batch, outcomes, strict=True):
-                if outcome.status == ERROR:
-                    errors[i] = outcome
-                elif not store.has(i):
-                    store.write(i, outcome)
-            bar.show(len(batch), sum(outcome.failed for outcome in outcomes))
+    bar = SweepProgress(shown, len(points), len(points) - len(missing))
+    for batch, outcomes in finished:
+        for i, outcome in zip(batch, outcomes, strict=True):
+            if outcome.status == ERROR:
+                errors[i] = outcome
+            elif not store.has(i):
+                store.write(i, outcome)
+        bar.show(len(batch), sum(outcome.failed for outcome in outcomes))
     return errors
 
 

@@ -35,6 +35,14 @@ def test_colours_span_the_pressure_in_kpa(solution, plotter):
     assert bounds.z_max - bounds.z_min < 0.55  # the mesh itself is not stretched
 
 
+def test_a_scene_off_screen_needs_no_display_and_does_not_complain(solution, monkeypatch, capfd):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    scene = op.plot_layer(solution, off_screen=True)
+    assert scene.screenshot(return_img=True).ndim == 3
+    scene.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_errors(solution, failed_solution, plotter):
     with pytest.raises(ValueError, match="needs a converged solution"):
         op.plot_layer(failed_solution, plotter)

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 import opfem as op
+from opfem.solvers.progress import Progress
 from opfem.sweep.progress import SweepProgress
 from tests.tolerances import ROUNDOFF
 
@@ -175,7 +176,7 @@ def test_one_device_is_all_devices_here():
 def test_progress_says_rate_failures_and_time_left(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    bar = SweepProgress(True, total=100, finished=40)
+    bar = SweepProgress(Progress(False), total=100, finished=40)
     now[0] = 10.0
     bar.show(done=20, failed=3)
     assert bar.text() == "2 points/s, 3 failed, 0:20 left"
