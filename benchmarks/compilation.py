@@ -46,11 +46,10 @@ class Programs:
     def __init__(self):
         from jax._src import compiler, dispatch
 
-        self.rows = []
         self.own_cpu, self.own_wall = 0.0, 0.0  # spent here, to be left out
         self.prepared = defaultdict(float)  # CPU seconds to trace and lower, by name
-        self._executables = []
-        self._compile, self._one_at_a_time = compiler.backend_compile_and_load, threading.Lock()
+        self._made, self._compiling, self._last, self._lock = [], [], 0.0, threading.Lock()
+        self._compile = compiler.backend_compile_and_load
         compiler.backend_compile_and_load = self._compiled
         watched, prepared = (dispatch.JAXPR_TRACE_EVENT, dispatch.JAXPR_TO_MLIR_MODULE_EVENT), self.prepared
 
@@ -77,21 +76,29 @@ class Programs:
         }
         self.own_cpu += time.thread_time() - begin[0]
         self.own_wall += time.perf_counter() - begin[1]
-        with self._one_at_a_time:  # so that seconds are of one program
-            before = time.process_time()
-            executable = self._compile(backend, module, *rest)
-            row["compile_cpu_s"] = time.process_time() - before
-        self.rows.append(row)
-        self._executables.append(executable)
+        row["compile_cpu_s"] = 0.0
+        self._share(self._compiling.append, row)
+        executable = self._compile(backend, module, *rest)
+        self._share(self._compiling.remove, row)
+        self._made.append((row, executable))
         return executable
+
+    def _share(self, change, row: dict) -> None:
+        """Share the CPU seconds since the last change between the programs that compile side by side."""
+        with self._lock:
+            now = time.process_time()
+            for one in self._compiling:
+                one["compile_cpu_s"] += (now - self._last) / len(self._compiling)
+            self._last = now
+            change(row)
 
     def described(self) -> dict:
         """Describe what was compiled; instructions are counted only now."""
-        for row, executable in zip(self.rows, self._executables, strict=True):
+        for row, executable in self._made:
             texts = [module.to_string() for module in executable.hlo_modules()]
             row["hlo_instructions"] = sum(" = " in line for text in texts for line in text.splitlines())
         named = {}
-        for row in self.rows:
+        for row, _ in self._made:
             entry = named.setdefault(row["name"], {"programs": 0, **dict.fromkeys(SIZES, 0)})
             entry["programs"] += 1
             for key in SIZES:
