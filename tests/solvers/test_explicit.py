@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,9 +39,13 @@ def matrices(made: Dynamics, u=None) -> tuple[np.ndarray, np.ndarray]:
     """The dense stiffness at a displacement, and the masses on its diagonal."""
     X = made.problem.positions
     u = jnp.zeros_like(X) if u is None else u
-    product = jax.linearize(lambda u: made.force.body.internal_force(u)[0], u)[1]
-    K = jax.lax.map(product, jnp.eye(X.size).reshape(X.size, *X.shape), batch_size=32)
-    return np.asarray(K).reshape(X.size, X.size), np.broadcast_to(made.mass, X.shape).ravel()
+    return np.asarray(_columns(made.force.body, u)).reshape(X.size, X.size), np.broadcast_to(made.mass, X.shape).ravel()
+
+
+@eqx.filter_jit
+def _columns(body, u):
+    product = jax.linearize(lambda u: body.internal_force(u)[0], u)[1]
+    return jax.lax.map(product, jnp.eye(u.size).reshape(u.size, *u.shape), batch_size=32)
 
 
 def frequencies(made: Dynamics) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -102,7 +107,7 @@ def test_32_step_wave_along_a_bar_is_exact_at_the_nodes():
 @pytest.mark.parametrize("element", ["full", "mean_dilatation"])
 def test_33_linear_energy_is_constant(element):
     """½ vᵀ M v half an increment on, plus ½ u_nᵀ K u_(n+1), at strains so small that the layer is linear."""
-    made, motion = floating((3, 2, 2), element=element)
+    made, motion = floating((2, 2, 2), element=element)
     rng = np.random.default_rng(0)
     motion = dataclasses.replace(motion, u=jnp.asarray(1e-14 * rng.standard_normal(motion.u.shape)))
     dt = jnp.asarray(0.5 * float(made.stable_increment(motion.u)))
@@ -122,7 +127,7 @@ def test_33_linear_energy_is_constant(element):
 
 def test_34_period_is_that_of_central_differences():
     """A mode started at rest follows cos(n ω_h Δt), ω_h = (2/Δt) asin(ω Δt/2)."""
-    made, motion = floating((2, 2, 1))
+    made, motion = floating((2, 2, 2))
     omega, modes, _ = frequencies(made)
     for k in (8, len(omega) - 1):
         dt = 0.7 * 2.0 / omega[-1]
