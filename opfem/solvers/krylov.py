@@ -74,14 +74,13 @@ def fgmres(
         )
         # Columns not reached keep the identity and a zero right-hand side.
         right = jnp.where(jnp.arange(basis) < end.j, end.g[:-1], 0.0)
-        y = _back_substitute(end.R, right)
-        x = x + y @ end.Z
-        r = b - _flat(operator(_unflat(x, like))).astype(b.dtype)
+        x = x + _back_substitute(end.R, right) @ end.Z
+        r = _rotate_back(end) @ end.V
         return x, r, iterations + end.j, _norm(r)
 
     def unfinished(carry):
         _, _, iterations, size = carry
-        return (size > 2.0 * target) & (iterations < max_iterations)
+        return (size > target) & (iterations < max_iterations)
 
     x, _, iterations, size = jax.lax.while_loop(
         unfinished, restart, (jnp.zeros_like(b), b, jnp.zeros((), int), _norm(b) + target)
@@ -129,6 +128,17 @@ def _back_substitute(R: Array, g: Array) -> Array:
         return y.at[i].set((g[i] - R[i] @ y) / R[i, i])
 
     return jax.lax.fori_loop(0, R.shape[0], row, jnp.zeros_like(g))
+
+
+def _rotate_back(s: _Basis) -> Array:
+    """Express the residual by the directions: so the operator appears, and is compiled, once."""
+
+    def rotate(i, r):
+        k = s.j - 1 - i
+        c, sn = s.rotations[0, k], s.rotations[1, k]
+        return jax.lax.dynamic_update_slice(r, jnp.stack([-sn * r[k + 1], c * r[k + 1]]), (k,))
+
+    return jax.lax.fori_loop(0, s.j, rotate, jnp.zeros_like(s.g).at[s.j].set(s.g[s.j]))
 
 
 def _norm(v: Array) -> Array:

@@ -2,7 +2,7 @@
 
 x and y are coarsened, z never: each column is solved exactly inside a Chebyshev smoother, which
 carries the strong coupling through the thickness and the contact stiffness. Coarse operators
-are Galerkin products of element matrices; everything is float32 inside float64 iterations.
+are Galerkin products, stencils like the finest one; everything is float32 inside float64 iterations.
 Interpolation to the finest grid lets heights follow lateral motion along a tilted contact (`_lean`).
 An odd count of elements is padded with an empty one, so any mesh coarsens.
 """
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.hex8 import gather
 from ..mechanics.staging import apart
 from .stencil import (
     ElementMatrices,
@@ -24,9 +23,11 @@ from .stencil import (
     Stencil,
     apply_stencil,
     assemble_stencil,
+    coarsen_stencil,
     column_blocks,
     dense_matrix,
-    held,
+    mask_stencil,
+    neighbours,
     with_unit_diagonal,
 )
 
@@ -89,26 +90,24 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
         free: Static mask of unknowns that are not held, or None.
         scale: Typical stiffness [N/mm], for the rows of held unknowns.
     """
-    K = K.astype(jnp.float32)
+    S = assemble_stencil(K.astype(jnp.float32))
     scale = scale.astype(jnp.float32)
     levels = []
     while True:
         mask = None if free is None else jnp.asarray(free, jnp.float32)
-        K = K if mask is None else held(K, mask)
-        S = assemble_stencil(K)
-        if free is not None or levels:  # a coarse grid may have ghosts
-            S = apart(with_unit_diagonal, S, scale)
+        S = S if free is None else S * jnp.asarray(mask_stencil(free), S.dtype)
+        whole = S if free is None and not levels else apart(with_unit_diagonal, S, scale)  # a coarse grid may have ghosts
         nodes = S.shape[-3:]
         if not levels:
-            finest, lean = S, jnp.zeros((2, *nodes), S.dtype)
+            finest, lean = whole, jnp.zeros((2, *nodes), S.dtype)
         if 3 * int(np.prod(nodes)) <= _DENSE_UNKNOWNS or max(nodes[1:]) <= 3:
-            return Multigrid(finest, lean, tuple(levels), _invert(dense_matrix(S), int(np.prod(nodes[1:]))), mask)
-        levels.append(Level(S, _invert_columns(column_blocks(S)), mask))
+            return Multigrid(finest, lean, tuple(levels), _invert(dense_matrix(whole), int(np.prod(nodes[1:]))), mask)
+        levels.append(Level(whole, _invert_columns(column_blocks(whole)), mask))
         if len(levels) == 1:
-            lean = _lean(S) if mask is None else mask[:2] * _lean(S)
-            K = apart(_leaning, K, lean)
-        for cell in _coarsened_axes(S.shape):
-            K = apart(partial(_coarsen, cell=cell), K)
+            lean = _lean(whole) if mask is None else mask[:2] * _lean(whole)
+            S = apart(_leaning, S, lean)
+        for axis in _coarsened_axes(S.shape):
+            S = apart(partial(coarsen_stencil, axis=axis), S)
         free = None if free is None else _coarsen_mask(free)
 
 
@@ -174,11 +173,10 @@ def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
     return jax.vmap(settle)(push[:, None])[:, 0]
 
 
-def _leaning(K: ElementMatrices, lean: Float[Array, "2 mz my mx"]) -> ElementMatrices:
+def _leaning(S: Stencil, lean: Float[Array, "2 mz my mx"]) -> Stencil:
     """Turn the third component into what a node's height exceeds the lean by."""
-    a = jnp.moveaxis(gather(lean), 2, 0)  # nz, corners, x or y, ny, nx
-    K = jnp.concatenate([K[:, :, :, :2] + a[:, :, None, :, None] * K[:, :, :, 2:], K[:, :, :, 2:]], axis=3)
-    return jnp.concatenate([K[..., :2, :, :] + a[:, None, :, None] * K[..., 2:, :, :], K[..., 2:, :, :]], axis=4)
+    S = jnp.concatenate([S[:, :, :, :2] + neighbours(lean)[:, :, None] * S[:, :, :, 2:], S[:, :, :, 2:]], axis=3)
+    return jnp.concatenate([S[:, :, :2] + lean[:, None] * S[:, :, 2:], S[:, :, 2:]], axis=2)
 
 
 def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
@@ -191,9 +189,12 @@ def _solve_columns(inverses: Array, r: PartNodal) -> PartNodal:
 
 
 def _times_columns(inverses: Array, r: PartNodal) -> PartNodal:
-    m = inverses.shape[0]
-    columns, rows = r.reshape(m, -1), inverses.reshape(m, m, -1)
-    return sum((rows[j] * columns[j] for j in range(1, m)), start=rows[0] * columns[0]).reshape(r.shape)
+    components, layers = r.shape[:2]
+    # Row j of an inverse, which is symmetric, times unknown j: summed over layers for all components at once.
+    rows = inverses.reshape(components, layers, components * layers, *r.shape[2:])
+    products = [rows[:, z] * r[:, z, None] for z in range(layers)]
+    by_component = sum(products[1:], start=products[0])
+    return sum((by_component[c] for c in range(1, components)), start=by_component[0]).reshape(r.shape)
 
 
 def _invert_columns(blocks: Array) -> Array:
@@ -240,41 +241,6 @@ def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(axis for axis in (-1, -2) if shape[axis] > 3)
 
 
-def _coarsen(K: ElementMatrices, cell: int) -> Array:
-    """Join pairs of elements along one axis (Galerkin product with linear interpolation)."""
-    nz = K.shape[0]
-    if K.shape[cell] % 2:
-        widths = [(0, 0)] * K.ndim
-        widths[cell] = (0, 1)
-        K = jnp.pad(K, widths)
-    even = jax.lax.slice_in_dim(K, 0, None, stride=2, axis=K.ndim + cell)
-    odd = jax.lax.slice_in_dim(K, 1, None, stride=2, axis=K.ndim + cell)
-    a_axis, b_axis = (3, 6) if cell == -1 else (2, 5)
-
-    def pairs(E):
-        E = E.reshape(nz, 2, 2, 2, 2, 2, 2, 3, 3, *E.shape[-2:])
-        return {(i, j): jnp.take(jnp.take(E, j, axis=b_axis), i, axis=a_axis) for i in (0, 1) for j in (0, 1)}
-
-    # The middle node is half of each coarse node; the outer one is a coarse node itself.
-    def low(p):
-        near = p[0, 1] * 0.5 + p[1, 1] * 0.25
-        return p[0, 0] + 0.5 * p[1, 0] + near, near, 0.5 * p[1, 0] + 0.25 * p[1, 1], 0.25 * p[1, 1]
-
-    def high(p):
-        near = 0.5 * p[0, 1] + 0.25 * p[0, 0]
-        return (
-            0.25 * p[0, 0],
-            near,
-            0.5 * p[1, 0] + 0.25 * p[0, 0],
-            p[1, 1] + 0.5 * (p[0, 1] + p[1, 0]) + 0.25 * p[0, 0],
-        )
-
-    c00, c01, c10, c11 = (e + o for e, o in zip(low(pairs(even)), high(pairs(odd)), strict=True))
-    rows = [jnp.stack([c00, c01], axis=b_axis - 1), jnp.stack([c10, c11], axis=b_axis - 1)]
-    C = jnp.stack(rows, axis=a_axis)
-    return C.reshape(nz, 8, 8, 3, 3, *C.shape[-2:])
-
-
 def _coarsen_mask(free: np.ndarray) -> np.ndarray:
     for axis in _coarsened_axes(free.shape):
         if free.shape[axis] % 2 == 0:  # odd count of elements: the ghost node is free
@@ -287,28 +253,22 @@ def _coarsen_mask(free: np.ndarray) -> np.ndarray:
 
 def _prolong(v: Array, shape: tuple[int, ...]) -> Array:
     for axis in _coarsened_axes(shape):
-        low = jax.lax.slice_in_dim(v, 0, v.shape[axis] - 1, axis=v.ndim + axis)
-        high = jax.lax.slice_in_dim(v, 1, None, axis=v.ndim + axis)
-        last = jax.lax.slice_in_dim(v, v.shape[axis] - 1, None, axis=v.ndim + axis)
-        pairs = jnp.stack([low, 0.5 * (low + high)], axis=v.ndim + axis + 1)
-        doubled = list(v.shape)
-        doubled[axis] = 2 * (v.shape[axis] - 1)
-        v = jnp.concatenate([pairs.reshape(doubled), last], axis=axis)
-    return v[..., : shape[-2], : shape[-1]]
+        v = _along(v, _interpolation(shape[axis]), axis)
+    return v
 
 
 def _restrict(r: Array) -> Array:
     for axis in _coarsened_axes(r.shape):
-        at = r.ndim + axis
-        if r.shape[axis] % 2 == 0:
-            widths = [(0, 0)] * r.ndim
-            widths[axis] = (0, 1)
-            r = jnp.pad(r, widths)
-        nodes = jax.lax.slice_in_dim(r, 0, None, stride=2, axis=at)
-        middle = 0.5 * jax.lax.slice_in_dim(r, 1, None, stride=2, axis=at)
-        widths = [(0, 0)] * r.ndim
-        widths[axis] = (0, 1)
-        after = jnp.pad(middle, widths)
-        widths[axis] = (1, 0)
-        r = nodes + after + jnp.pad(middle, widths)
+        r = _along(r, _interpolation(r.shape[axis]).T, axis)
     return r
+
+
+def _interpolation(n: int) -> np.ndarray:
+    """Build the matrix of linear interpolation to n nodes from every other one, the last perhaps beyond the end."""
+    return np.maximum(0.0, 1.0 - 0.5 * np.abs(np.arange(n)[:, None] - 2 * np.arange(n // 2 + 1)))
+
+
+def _along(values: Array, matrix: np.ndarray, axis: int) -> Array:
+    """Multiply a matrix with the values along one axis."""
+    product = jnp.tensordot(jnp.asarray(matrix, values.dtype), values, (1, values.ndim + axis))
+    return jnp.moveaxis(product, 0, axis)

@@ -13,7 +13,6 @@ from opfem.mechanics.internal import layer_body
 from opfem.model import LayerMesh
 from opfem.solvers.krylov import fgmres
 from opfem.solvers.multigrid import (
-    _coarsen,
     _coarsen_mask,
     _coarsened_axes,
     _invert,
@@ -25,7 +24,14 @@ from opfem.solvers.multigrid import (
     apply_multigrid,
     build_multigrid,
 )
-from opfem.solvers.stencil import apply_stencil, assemble_stencil, column_blocks, held, with_unit_diagonal
+from opfem.solvers.stencil import (
+    apply_stencil,
+    assemble_stencil,
+    coarsen_stencil,
+    column_blocks,
+    mask_stencil,
+    with_unit_diagonal,
+)
 from tests.oracles import assemble_dense, linear_interpolation, nodal_index
 from tests.tolerances import ROUNDOFF, ROUNDOFF_FLOAT32, SOLVER
 
@@ -91,17 +97,18 @@ def test_restriction_is_the_transpose_of_prolongation(elements):
 
 
 @MESHES
-def test_coarse_elements_are_the_galerkin_product(elements):
+def test_coarse_stencil_is_the_galerkin_product(elements):
     K = element_matrices(elements)
-    coarse = jnp.array(K)
+    coarse = assemble_stencil(jnp.array(K))
     for axis in _coarsened_axes((1, *node_shape(elements))):
-        coarse = _coarsen(coarse, axis)
-    assert coarse.shape[-2:] == coarse_counts(elements)[1::-1]
+        coarse = coarsen_stencil(coarse, axis)
+    shape = node_shape(coarse_counts(elements))
+    assert coarse.shape[-3:] == shape
     P = interpolation(elements)
     expected = P.T @ assemble_dense(K) @ P
-    np.testing.assert_allclose(
-        assemble_dense(np.asarray(coarse)), expected, ROUNDOFF, 10 * ROUNDOFF * np.abs(expected).max()
-    )
+    columns = np.eye(len(expected)).reshape(-1, 3, *shape)
+    product = np.asarray(jax.vmap(lambda u: apply_stencil(coarse, u))(jnp.array(columns))).reshape(expected.shape).T
+    np.testing.assert_allclose(product, expected, ROUNDOFF, 10 * ROUNDOFF * np.abs(expected).max())
 
 
 def test_coarse_level_is_the_galerkin_product_of_free_unknowns():
@@ -136,7 +143,7 @@ def test_column_inverses_equal_numpy():
     nx, ny, nz = elements
     free = bottom_and_side_held(elements)
     K = layer_stiffness(elements)
-    S = with_unit_diagonal(assemble_stencil(held(jnp.array(K), jnp.array(free))), jnp.asarray(1e-3))
+    S = with_unit_diagonal(assemble_stencil(jnp.array(K)) * mask_stencil(free), jnp.asarray(1e-3))
     inverses = np.asarray(_invert_columns(column_blocks(S)))
     dense = free.ravel()[:, None] * assemble_dense(K) * free.ravel() + 1e-3 * np.diag(1 - free.ravel())
     for y in range(ny + 1):
@@ -159,7 +166,9 @@ def test_leaning_turns_heights_into_what_exceeds_the_lean(elements):
     lean = np.random.default_rng(4).standard_normal((2, *shape))
     K = element_matrices(elements)
     expected = leaning_matrix(lean).T @ assemble_dense(K) @ leaning_matrix(lean)
-    found = assemble_dense(np.asarray(_leaning(jnp.array(K), jnp.array(lean))))
+    leaning = _leaning(assemble_stencil(jnp.array(K)), jnp.array(lean))
+    columns = jnp.eye(3 * lean[0].size).reshape(-1, 3, *lean.shape[1:])
+    found = np.asarray(jax.vmap(lambda u: apply_stencil(leaning, u))(columns)).reshape(len(columns), -1).T
     np.testing.assert_allclose(found, expected, atol=100 * ROUNDOFF * np.abs(expected).max())
 
 
@@ -202,7 +211,7 @@ def rollers(elements, bonded):
 def _solve(K, b, mask):
     free = np.frombuffer(mask).reshape(b.shape)
     scale = jnp.asarray(1e-3)
-    S = with_unit_diagonal(assemble_stencil(held(K, jnp.array(free))), scale)
+    S = with_unit_diagonal(assemble_stencil(K) * mask_stencil(free), scale)
     multigrid = build_multigrid(K, free, scale)
     solution = fgmres(
         lambda v: apply_stencil(S, v),
