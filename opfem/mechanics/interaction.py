@@ -91,6 +91,36 @@ class TangentLaw(NamedTuple):
         return self._replace(clearance=None)
 
 
+class FacePoints(NamedTuple):
+    """Where the points of faces are, and the rigid surface at their x and y.
+
+    Attributes:
+        fraction: Load fraction [-].
+        position: Of the points [mm].
+        tangents: dx/dξ and dx/dη there `(2, 3, points, *faces)` [mm].
+        height: Of the surface [mm].
+        slope: Of the surface along x and y `(2, points, *faces)` [-].
+        bend: Second derivatives of the surface `(2, 2, points, *faces)` [1/mm]; None where only forces are asked for.
+    """
+
+    fraction: Array
+    position: PointVector
+    tangents: Float[Array, "2 3 points *faces"]
+    height: Float[Array, "points *faces"]
+    slope: Float[Array, "2 points *faces"]
+    bend: Float[Array, "2 2 points *faces"] | None
+
+    @property
+    def stretch(self) -> Float[Array, "points *faces"]:
+        """Area of the surface over that of its projection on the plane z = 0 [-]."""
+        return jnp.sqrt(1.0 + self.slope[0] ** 2 + self.slope[1] ** 2)
+
+    @property
+    def normal(self) -> PointVector:
+        """Normal of the surface, upward."""
+        return jnp.concatenate([-self.slope, jnp.ones_like(self.slope[:1])]) / self.stretch
+
+
 class PointContact(NamedTuple):
     """Contact at face points: tractions per current area [MPa], and the history after it."""
 
@@ -102,7 +132,6 @@ class PointContact(NamedTuple):
     friction: Float[Array, "2 points *faces"]  # conjugate to slip in the surface's (x, y)
     sliding: Array
     slips: Array  # friction at its limit, or just below after an increment that only settles
-    guard: Float[Array, "3 3 points *faces"]  # symmetric positive part of -d(traction)/dx
 
 
 class RigidSurface(eqx.Module):
@@ -116,11 +145,16 @@ class RigidSurface(eqx.Module):
 
     def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Evaluate height [mm] and slopes [-] when a fraction of the motion is done."""
+        d = self.derivatives(fraction, x, y, 1)
+        return d[0, 0], d[0, 1], d[1, 0]
+
+    def derivatives(self, fraction: Array, x: Array, y: Array, order: int) -> Float[Array, "along_y along_x *points"]:
+        """Evaluate height [mm] and its derivatives (`HeightField.derivatives`)."""
         if self.start is None or self.end is None:
-            zero = jnp.zeros_like(x)
-            return zero, zero, zero
+            return jnp.zeros((order + 1, order + 1, *x.shape), x.dtype)
         low, high = self.start.coefficients, self.end.coefficients
-        return eqx.tree_at(lambda f: f.coefficients, self.end, (1.0 - fraction) * low + fraction * high)(x, y)
+        now = eqx.tree_at(lambda f: f.coefficients, self.end, (1.0 - fraction) * low + fraction * high)
+        return now.derivatives(x, y, order)
 
     def around(self, x: Array, y: Array) -> "RigidPatches | None":
         """Collect what the surface is made of around points [mm]; None for the plane z = 0."""
@@ -205,26 +239,29 @@ class ContactFace(eqx.Module):
         zero = jnp.zeros_like(position)
         return SlipHistory(position, zero, zero, jnp.zeros((), position.dtype), zero[0])
 
-    def at_points(
-        self, fraction: Array, position: PointVector, history: SlipHistory, law: TangentLaw | None = None
-    ) -> PointContact:
-        """Evaluate contact at face points [mm], with the contact's own law or a linearised one."""
-        height, slope_x, slope_y = self.surface.at(fraction, position[0], position[1])
-        side = 1.0 if self.above else -1.0
-        if law is not None:
-            slope_x, slope_y = (_scaled_slope(s, law.curvature) for s in (slope_x, slope_y))
-        stretch = jnp.sqrt(1.0 + slope_x**2 + slope_y**2)
-        normal = jnp.stack([-slope_x, -slope_y, jnp.ones_like(slope_x)]) / stretch
-        clearance = (side * (height - position[2]) + self.offset) / stretch
-        pressure, push, stiffness = self._pressure(fraction, position[2], clearance, law or self._law(history))
-        friction = self._friction(pressure, position, history, slope_x, slope_y, None if law is None else law.sticks)
-        traction = friction.traction - side * push * normal
-        eye = jnp.eye(3, dtype=position.dtype).reshape(3, 3, *[1] * pressure.ndim)
-        along = normal[:, None] * normal[None]
-        slid_along = friction.direction[:, None] * friction.direction[None]
-        guard = stiffness * along + friction.stiffness * (eye - along - slid_along)
+    def locate(self, fraction: Array, x: Corners, bends: bool = False) -> FacePoints:
+        """Find the points of faces with corners x [mm], and the surface there, with its second derivatives if asked."""
+        position, *tangents = surface_tangents(x, self.rule)
+        order = 2 if bends else 1
+
+        def under(surface, fraction, position):
+            return surface.derivatives(fraction, position[0], position[1], order)
+
+        d = (
+            under(self.surface, fraction, position)
+            if self.surface.end is None
+            else apart(under, self.surface, fraction, position)
+        )
+        bend = jnp.stack([jnp.stack([d[0, 2], d[1, 1]]), jnp.stack([d[1, 1], d[2, 0]])]) if bends else None
+        return FacePoints(fraction, position, jnp.stack(tangents), d[0, 0], jnp.stack([d[0, 1], d[1, 0]]), bend)
+
+    def at_points(self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None) -> PointContact:
+        """Evaluate contact at face points, with the contact's own law or a linearised one."""
+        clearance = self._clearance(points)
+        pressure, push, _, _ = self._pressure(points, clearance, law or self._law(history))
+        friction = self._friction(pressure, points, history, None if law is None else law.sticks)
         return PointContact(
-            traction,
+            friction.traction - self._side * push * points.normal,
             pressure,
             clearance,
             friction.elastic,
@@ -232,8 +269,14 @@ class ContactFace(eqx.Module):
             friction.conjugate,
             friction.sliding,
             friction.slips,
-            guard,
         )
+
+    @property
+    def _side(self) -> float:
+        return 1.0 if self.above else -1.0
+
+    def _clearance(self, points: FacePoints) -> Float[Array, "points *faces"]:
+        return (self._side * (points.height - points.position[2]) + self.offset) / points.stretch
 
     @property
     def is_exact(self) -> bool:
@@ -255,30 +298,33 @@ class ContactFace(eqx.Module):
         gap = self.contact.law.clearance(after.pressure - before.pressure, self.stiffness)
         return jnp.max(jnp.where(after.pressure > 0, jnp.abs(gap), 0.0))
 
-    def _pressure(self, fraction: Array, z: Array, clearance: Array, law) -> tuple[Array, Array, Array]:
-        """Compute the pressure that bounds friction, that which pushes, and how fast it rises [MPa/mm]."""
+    def _pressure(self, points: FacePoints, clearance: Array, law) -> tuple[Array, Array, Array, Array]:
+        """Compute the pressure that bounds friction and that which pushes [MPa], and their slopes [MPa/mm].
+
+        Slopes are by clearance; by height under an imposed pressure.
+        """
         if self.imposed is not None:
-            push, slope = jax.jvp(lambda z: self.imposed.springs(fraction, z), (z,), (jnp.ones_like(z),))
-            return self.imposed.bounding(fraction, self.rule, push), push, slope
+            z = points.position[2]
+            push, slope = jax.jvp(lambda z: self.imposed.springs(points.fraction, z), (z,), (jnp.ones_like(z),))
+            pressure = self.imposed.bounding(points.fraction, self.rule, push)
+            return pressure, push, jnp.where(pressure > 0, slope, 0.0), slope
         pressure, slope = jax.jvp(law, (clearance,), (jnp.ones_like(clearance),))
-        return pressure, pressure, -slope
+        return pressure, pressure, slope, slope
 
     def initial_iterate(self, history: SlipHistory) -> ContactIterate:
         """Start from the pressure of the last increment, as if every point had stuck."""
         return ContactIterate(history.pressure, jnp.zeros_like(history.elastic), jnp.zeros_like(history.pressure))
 
     def tangent_law(
-        self, fraction: Array, x: Corners, history: SlipHistory, iterate: ContactIterate, curvature: Array
+        self, points: FacePoints, history: SlipHistory, iterate: ContactIterate, curvature: Array
     ) -> TangentLaw:
-        """Linearise contact for the state x.
+        """Linearise contact at face points.
 
         A point without pressure that has come to touch takes what the law gives there, at most
         the pressure that shortens an element by a thousandth.
         """
-        position = surface_tangents(x, self.rule)[0]
-        trial = history.elastic + position[:2] - history.position
-        sticks = jnp.sum(trial * iterate.direction, axis=0) < 0
-        clearance = self.at_points(fraction, position, history).clearance
+        sticks = jnp.sum(_trial(points, history) * iterate.direction, axis=0) < 0
+        clearance = self._clearance(points)
         most = 1e-3 * self.stiffness * self.element_size
         law = self._law(history)
         pressure = jnp.maximum(iterate.pressure, jnp.minimum(law(clearance), most))
@@ -289,25 +335,25 @@ class ContactFace(eqx.Module):
         closed = (pressure - self.stiffness * (clearance - at) >= 0) & (slope < 0)
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
 
-    def follow(
-        self, fraction: Array, x: Corners, change: Corners, history: SlipHistory, law: TangentLaw
-    ) -> ContactIterate:
+    def follow(self, points: FacePoints, change: Corners, history: SlipHistory, law: TangentLaw) -> ContactIterate:
         """Compute what the next iteration remembers once a part of the step `change` is taken (`after`).
 
         The pressure follows the clearance's linear change.
         """
-
-        def clearance(corners):
-            return self.at_points(fraction, surface_tangents(corners, self.rule)[0], history).clearance
-
-        now, slope = jax.jvp(clearance, (x,), (change,))
-        point = self.at_points(fraction, surface_tangents(x, self.rule)[0], history, law)
+        step = jnp.moveaxis(contract(quadrature(self.rule).N, change), 1, 0)
+        clearance = self._clearance(points)
+        further = jnp.sum(self._clearance_slope(points, clearance, 1.0) * step, axis=0)
+        point = self.at_points(points, history, law)
         return ContactIterate(
-            law.pressure, jnp.where(point.sliding, point.elastic, 0.0), law(now + slope) - law.pressure
+            law.pressure, jnp.where(point.sliding, point.elastic, 0.0), law(clearance + further) - law.pressure
         )
 
-    def _friction(self, pressure, position, history, slope_x, slope_y, sticks) -> "_Friction":
-        trial = history.elastic + position[:2] - history.position
+    def _clearance_slope(self, points: FacePoints, clearance: Array, curvature: Array | float) -> PointVector:
+        """Compute the derivative of the clearance by the points' positions [-], with a share of the curvature."""
+        return -self._side * points.normal - clearance / points.stretch * _stretch_slope(points, curvature)
+
+    def _friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "_Friction":
+        trial, (slope_x, slope_y) = _trial(points, history), points.slope
         rise = slope_x * trial[0] + slope_y * trial[1]
         squared = trial[0] ** 2 + trial[1] ** 2 + rise**2
         length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
@@ -319,19 +365,69 @@ class ContactFace(eqx.Module):
         elastic = jnp.where(closed, ratio * trial, 0.0)
         stiffness = self.contact.stick_stiffness(pressure, self.element_size)
         climb = slope_x * elastic[0] + slope_y * elastic[1]
-        tangent = jnp.stack([elastic[0], elastic[1], climb])
-        conjugate = -stiffness * jnp.stack([elastic[0] + slope_x * climb, elastic[1] + slope_y * climb])
-        unit = jnp.stack([trial[0], trial[1], rise]) / jnp.where(sliding, length, 1.0)
+        tangent = jnp.concatenate([elastic, climb[None]])
         return _Friction(
             traction=-stiffness * tangent,
             stiffness=stiffness * ratio,
-            direction=jnp.where(sliding, unit, 0.0),
+            reach=jnp.concatenate([trial, rise[None]]),
+            length=length,
             elastic=elastic,
             slid=jnp.where(closed, trial - elastic, 0.0),
-            conjugate=conjugate,
+            conjugate=-stiffness * (elastic + points.slope * climb),
+            limited=sliding,
             sliding=closed & sliding,
             slips=closed & (length > _AT_LIMIT * limit),
         )
+
+    def _linearised(
+        self, points: FacePoints, history: SlipHistory, law: TangentLaw | None
+    ) -> tuple[PointVector, Array, Array]:
+        """Compute the traction [MPa], its derivative by the points' positions, and the guard [MPa/mm].
+
+        All in closed form: component i by position j `(3 i, 3 j, points, *faces)`. The guard is the symmetric positive
+        part of minus the derivative: without curvature and sliding's coupling.
+        """
+        curvature, sticks = (1.0, None) if law is None else (law.curvature, law.sticks)
+        assert points.bend is not None
+        normal, stretch, clearance = points.normal, points.stretch, self._clearance(points)
+        own = self._law(history) if law is None else law.at_its_pressure()
+        pressure, push, slope, push_slope = self._pressure(points, clearance, own)
+        if self.imposed is None:
+            by_clearance = self._clearance_slope(points, clearance, curvature)
+        else:
+            by_clearance = jnp.zeros_like(normal).at[2].set(1.0)  # the springs' height takes its place
+        by_pressure, by_push = slope * by_clearance, push_slope * by_clearance
+        bend = jnp.pad(curvature * points.bend, [(0, 1), (0, 1)] + [(0, 0)] * pressure.ndim)
+        by_normal = -(bend + normal[:, None] * _stretch_slope(points, curvature)) / stretch
+
+        friction = self._friction(pressure, points, history, sticks)
+        climbing = jnp.pad(points.slope, [(0, 1)] + [(0, 0)] * pressure.ndim)
+        rising = climbing + bend[0] * friction.reach[0] + bend[1] * friction.reach[1]
+        plane = np.diag([1.0, 1.0, 0.0]).reshape(3, 3, *[1] * pressure.ndim)
+        up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, *[1] * pressure.ndim)
+        by_reach = plane + up * rising
+        _, softer = jax.jvp(self._stick, (pressure,), (jnp.ones_like(pressure),))
+        _, strength = jax.jvp(lambda p: self._stick(p) * self._limit(p), (pressure,), (jnp.ones_like(pressure),))
+        length = jnp.where(friction.limited, friction.length, 1.0)
+        shrinking = friction.stiffness / length * jnp.sum(friction.reach[:, None] / length * by_reach, axis=0)
+        by_stiffness = jnp.where(friction.limited, strength / length * by_pressure - shrinking, softer * by_pressure)
+        rubbing = friction.reach[:, None] * by_stiffness + friction.stiffness * by_reach
+        by_position = -jnp.where(pressure > 0, rubbing, 0.0) - self._side * (
+            normal[:, None] * by_push + push * by_normal
+        )
+
+        along = normal[:, None] * normal
+        direction = jnp.where(friction.limited, friction.reach / length, 0.0)
+        eye = np.eye(3).reshape(plane.shape)
+        guard = friction.stiffness * (eye - along - direction[:, None] * direction)
+        pushing = push_slope if self.imposed is not None else -slope
+        return friction.traction - self._side * push * normal, by_position, pushing * along + guard
+
+    def _stick(self, pressure: Array) -> Array:
+        return self.contact.stick_stiffness(pressure, self.element_size)
+
+    def _limit(self, pressure: Array) -> Array:
+        return self.contact.slip_limit(pressure, self.element_size)
 
     def _area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
         """Compute the area per unit of (ξ, η) that the surface pushes on [mm²]."""
@@ -347,16 +443,13 @@ class ContactFace(eqx.Module):
         towards = jnp.maximum(area[2] if self.above else -area[2], 0.0)
         return jnp.where(self.sides, towards, size(area))
 
-    def force(self, fraction: Array, x: Corners, history: SlipHistory, law: TangentLaw | None = None) -> Corners:
+    def force(self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None) -> Corners:
         """Compute the force on the layer at the corners of the faces [N]."""
-        position, *tangents = surface_tangents(x, self.rule)
-        area = self._area(jnp.stack(tangents))
-        area = area if law is None else _scaled_slope(area, law.curvature)
-        density = self.at_points(fraction, position, history, law).traction * area
+        density = self.at_points(points, history, law).traction * self._area(points.tangents)
         return to_corners(jnp.moveaxis(density, 1, 0), self.rule)
 
     def stiffness_matrices(
-        self, fraction: Array, x: Corners, history: SlipHistory, law: TangentLaw | None = None
+        self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None
     ) -> tuple[Array, Array]:
         """Compute -d(force)/dx of every face `(4 a, 4 b, 3, 3, *faces)` [N/mm].
 
@@ -365,54 +458,47 @@ class ContactFace(eqx.Module):
             for the preconditioner: without curvature, area change and sliding's coupling.
         """
         q = quadrature(self.rule)
-        position, *tangents = surface_tangents(x, self.rule)
-        at_law = None if law is None else law.at_its_pressure()
-
-        def traction(moved):
-            point = self.at_points(fraction, moved, history, at_law)
-            return point.traction, point
-
-        def linearised(position):
-            now, change, point = jax.linearize(traction, position, has_aux=True)
-            unit = jnp.eye(3, dtype=x.dtype).reshape(3, 3, *[1] * (position.ndim - 1))
-            by_position = jax.vmap(change)(jnp.broadcast_to(unit, (3, *position.shape)))  # j, i, points
-            return now, by_position, point
-
-        now, by_position, point = apart(linearised, position)
-        area, pull_back = jax.vjp(self._area, jnp.stack(tangents))
+        now, by_position, guard = apart(lambda face, *args: face._linearised(*args), self, points, history, law)
+        area, pull_back = jax.vjp(self._area, points.tangents)
         (by_tangents,) = pull_back(jnp.broadcast_to(1.0 if law is None else law.curvature, area.shape))
-        slopes = jnp.concatenate([(by_position * area)[None], by_tangents[:, :, None] * now])
-        slopes = jnp.moveaxis(slopes, (3, 0, 2, 1), (0, 1, 2, 3))  # points, (N, dN_ξ, dN_η), i, j
+        slopes = jnp.concatenate([(by_position * area)[None], by_tangents[:, None] * now[None, :, None]])
+        slopes = jnp.moveaxis(slopes, 3, 0)  # points, (N, dN_ξ, dN_η), i, j
         weights = q.N * q.weights[:, None]
         both = np.concatenate([q.N[:, None], q.dN], axis=1)
         pairs = np.einsum("qa,qmb->abqm", weights, both).reshape(4, 4, -1)
         exact = -contract(pairs, slopes.reshape(-1, *slopes.shape[2:]))
-        guard = jnp.moveaxis(point.guard * area, 2, 0)
         mass = np.einsum("qa,qb->abq", weights, q.N)
-        return exact, contract(mass, guard)
+        return exact, contract(mass, jnp.moveaxis(guard * area, 2, 0))
 
-    def advance(self, fraction: Array, x: Corners, history: SlipHistory) -> SlipHistory:
+    def advance(self, points: FacePoints, history: SlipHistory) -> SlipHistory:
         """Compute the history at the end of an increment."""
-        position, *tangents = surface_tangents(x, self.rule)
-        point = self.at_points(fraction, position, history)
+        point = self.at_points(points, history)
         weights = quadrature(self.rule).weights
-        work = self._area(jnp.stack(tangents)) * jnp.sum(point.friction * point.slid, axis=0)
+        work = self._area(points.tangents) * jnp.sum(point.friction * point.slid, axis=0)
         dissipated = history.dissipated - jnp.sum(jnp.tensordot(weights, work, 1))
-        return SlipHistory(position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
+        return SlipHistory(points.position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
+
+
+def _trial(points: FacePoints, history: SlipHistory) -> Float[Array, "2 points *faces"]:
+    """Compute the elastic slip [mm] of points that would all stick."""
+    return history.elastic + points.position[:2] - history.position
+
+
+def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
+    """Compute the derivative of the surface's stretch by position [1/mm], with a share of the curvature."""
+    assert points.bend is not None
+    along = points.slope[0] * points.bend[0] + points.slope[1] * points.bend[1]
+    return jnp.concatenate([curvature * along / points.stretch, jnp.zeros_like(along[:1])])
 
 
 class _Friction(NamedTuple):
     traction: Array
-    stiffness: Array
-    direction: Array
+    stiffness: Array  # of the points as they are, slid or not [MPa/mm]
+    reach: Array  # elastic slip if all points stuck, in space [mm]
+    length: Array  # of it [mm]
     elastic: Array
     slid: Array
     conjugate: Array
+    limited: Array  # whether friction is at its limit, where there is any
     sliding: Array
     slips: Array
-
-
-def _scaled_slope(value: Array, share: Array | float) -> Array:
-    """Keep a value, and a share of its derivative."""
-    still = jax.lax.stop_gradient(value)
-    return still + share * (value - still)

@@ -32,18 +32,52 @@ class HeightField(eqx.Module):
 
     def __call__(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Evaluate height [mm] and slopes ds/dx, ds/dy [-] at spatial points [mm]."""
-        return self.around(x, y)(x, y)
+        d = self.derivatives(x, y, 1)
+        return d[0, 0], d[0, 1], d[1, 0]
+
+    def derivatives(self, x: Array, y: Array, order: int) -> Float[Array, "along_y along_x *points"]:
+        """Evaluate height [mm] and its derivatives at spatial points [mm]; beyond the grid those across its edge are 0.
+
+        Args:
+            x: Of the points.
+            y: Of the points.
+            order: Highest order along x, and along y.
+        """
+        my, mx = self.coefficients.shape
+        i, j = _cell(self._in_cells(x, 0), mx), _cell(self._in_cells(y, 1), my)
+        along_x = self._weights(x, i, 0, order)
+        along_y = self._weights(y, j, 1, order)
+        values = self._around(i, j)
+        rows = sum(along_x[:, None, n] * values[None, :, n] for n in range(4))  # order along x, row, points
+        return sum(along_y[:, m, None] * rows[None, :, m] for m in range(4))
 
     def around(self, x: Array, y: Array) -> "Patches":
         """Collect what the surface is made of around points [mm], to evaluate it there again and again."""
         my, mx = self.coefficients.shape
         i, j = _cell(self._in_cells(x, 0), mx), _cell(self._in_cells(y, 1), my)
+        basis = jnp.asarray(_CUBICS[self.interpolation], self.coefficients.dtype)
+        powers = jnp.einsum("ma,nb,mn...->ab...", basis, basis, self._around(i, j))
+        return Patches(self, powers, i, j)
+
+    def _around(self, i: Array, j: Array) -> Float[Array, "4 4 *points"]:
+        """Collect the four by four coefficients that a cell's polynomial is made of."""
+        my, mx = self.coefficients.shape
         around = np.arange(-1, 3).reshape(4, *[1] * i.ndim)
         rows, columns = jnp.clip(j + around, 0, my - 1), jnp.clip(i + around, 0, mx - 1)
-        values = self.coefficients[rows[:, None], columns]
-        basis = jnp.asarray(_CUBICS[self.interpolation], values.dtype)
-        powers = jnp.einsum("ma,nb,mn...->ab...", basis, basis, values)
-        return Patches(self, powers, i, j)
+        return self.coefficients[rows[:, None], columns]
+
+    def _weights(self, position: Array, cell: Array, axis: int, order: int) -> Float[Array, "orders 4 *points"]:
+        """Compute the weights of the four coefficients along an axis, and their derivatives by position."""
+        t, inside = _local(self._in_cells(position, axis), cell, self.coefficients.shape[1 - axis])
+        powers = jnp.stack([jnp.ones_like(t), t, t * t, t * t * t])
+        basis = [_CUBICS[self.interpolation]]
+        for _ in range(order):
+            basis.append(np.pad(basis[-1][:, 1:] * np.arange(1, 4), ((0, 0), (0, 1))))
+        weights = jnp.tensordot(jnp.asarray(np.stack(basis), t.dtype), powers, 1)
+        per_length = 1.0 / self.spacing[axis]
+        scales = jnp.stack([per_length**k for k in range(order + 1)]).reshape(order + 1, *[1] * (t.ndim + 1))
+        across = np.arange(order + 1).reshape(scales.shape) > 0
+        return jnp.where(across & ~inside, 0.0, weights * scales)
 
     def _in_cells(self, position: Array, axis: int) -> Array:
         return (position - self.origin[axis]) / self.spacing[axis]

@@ -116,7 +116,7 @@ class Problem(eqx.Module):
 
     def forces(self, x: Unknowns, fraction: Array, state: State) -> Forces:
         """Compute internal and applied nodal forces [N]."""
-        return self.with_contact(self.own_forces(x, state), x.u, fraction, state)
+        return self.with_contact(self.own_forces(x, state), self.locate(x.u, fraction), fraction, state)
 
     def own_forces(self, x: Unknowns, state: State) -> Forces:
         """Compute the forces of layer, medium and spring [N], none applied."""
@@ -127,44 +127,43 @@ class Problem(eqx.Module):
         spring = None if self.spring is None else -self.spring * u[:2, 0]
         return Forces(internal, volume, Bodies(), spring, smallest_J)
 
+    def locate(self, u: Nodal, fraction: Array, bends: bool = False) -> Bodies:
+        """Find the points of all faces that may touch a body (`FacePoints`), with the surfaces' bends if asked."""
+        return self.contacts.map(lambda body, face: face.locate(fraction, self._take(self.positions + u, body), bends))
+
     def with_contact(
-        self, forces: Forces, u: Nodal, fraction: Array, state: State, laws: Bodies | None = None
+        self, forces: Forces, points: Bodies, fraction: Array, state: State, laws: Bodies | None = None
     ) -> Forces:
         """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
         applied = self.contacts.map(
-            lambda body, face, history, law: to_touching(
-                face.force(fraction, self._corners(u, body), history, law), self.elements
-            ),
+            lambda _, face, points, history, law: to_touching(face.force(points, history, law), self.elements),
+            points,
             state.histories,
             laws or Bodies(),
         )
-        none = Touching(jnp.zeros_like(u[:, 0]), None)
+        none = Touching(jnp.zeros_like(forces.internal[:, 0]), None)
         window, sample = (none if touching is None else touching for touching in applied)
         if self.dead is not None:
             sample = sample._replace(face=sample.face + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1])
         return forces._replace(applied=Bodies(window, sample))
 
-    def _corners(self, u: Nodal, body: Body) -> Corners:
-        """Take the corner positions [mm] of all faces that may touch a body."""
-        return self._take(self.positions + u, body)
-
     def _take(self, values: Nodal, body: Body) -> Corners:
         return take(values, body, with_sides=getattr(self.contacts, body).sides is not None)
 
-    def tangent_laws(self, u: Nodal, fraction: Array, state: State, iterates: Bodies, curvature: Array) -> Bodies:
+    def tangent_laws(self, points: Bodies, state: State, iterates: Bodies, curvature: Array) -> Bodies:
         """Linearise contact (`TangentLaw`)."""
         return self.contacts.map(
-            lambda body, face, history, it: face.tangent_law(fraction, self._corners(u, body), history, it, curvature),
+            lambda _, face, points, history, it: face.tangent_law(points, history, it, curvature),
+            points,
             state.histories,
             iterates,
         )
 
-    def follow(self, u: Nodal, change: Nodal, fraction: Array, state: State, laws: Bodies) -> Bodies:
+    def follow(self, points: Bodies, change: Nodal, state: State, laws: Bodies) -> Bodies:
         """Compute what the next iteration remembers (`ContactIterate`) once a part of the step `change` is taken."""
         return self.contacts.map(
-            lambda body, face, history, law: face.follow(
-                fraction, self._corners(u, body), self._take(change, body), history, law
-            ),
+            lambda body, face, points, history, law: face.follow(points, self._take(change, body), history, law),
+            points,
             state.histories,
             laws,
         )
@@ -215,7 +214,7 @@ class Problem(eqx.Module):
         """
         u = x.u
         free = jnp.asarray(self.free)
-        forces = self.with_contact(own or self.own_forces(x, state), u, fraction, state)
+        forces = self.with_contact(own or self.own_forces(x, state), self.locate(u, fraction), fraction, state)
         residual = self.residual(forces, held)
         misplaced = free * (u - state.u) + (1.0 - free) * (u - self.with_imposed(u, fraction))
         placing = self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
@@ -285,7 +284,15 @@ class Problem(eqx.Module):
             return forces.spring
         return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]), 0.0)
 
-    def tangent(self, x: Unknowns, fraction: Array, state: State, laws: Bodies, transposed: bool = False) -> Tangent:
+    def tangent(
+        self,
+        x: Unknowns,
+        fraction: Array,
+        state: State,
+        laws: Bodies,
+        transposed: bool = False,
+        points: Bodies | None = None,
+    ) -> Tangent:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
         Args:
@@ -294,6 +301,7 @@ class Problem(eqx.Module):
             state: Where the increment started.
             laws: Linearised contact laws; empty for the contact's own.
             transposed: Whether to return the transposed tangent.
+            points: `locate(x.u, fraction, bends=True)`, where that is known.
         """
         u, mean_stress = x
         body, low_order = _single(self.body), _single(self.low_order or self.body)
@@ -305,7 +313,8 @@ class Problem(eqx.Module):
             volume, stiffness = couple_volume(body, self.free, _single(u), _single(self.stress_scale))
             K = K + stiffness
         matrices = self.contacts.map(
-            lambda body, face, history, law: face.stiffness_matrices(fraction, self._corners(u, body), history, law),
+            lambda _, face, *args: face.stiffness_matrices(*args),
+            points or self.locate(u, fraction, bends=True),
             state.histories,
             laws,
         )
@@ -362,7 +371,7 @@ class Problem(eqx.Module):
             return so_far + jnp.vdot(mean, u - state.u)
 
         histories = self.contacts.map(
-            lambda body, face, history: face.advance(fraction, self._corners(u, body), history), state.histories
+            lambda _, face, *args: face.advance(*args), self.locate(u, fraction), state.histories
         )
         return State(
             u=u,

@@ -165,14 +165,15 @@ def solve_increment(
     def find_step(it):
         u = it.x.u
         curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
-        laws = problem.tangent_laws(u, fraction, state, it.contact, curvature)
-        r = problem.residual(problem.with_contact(it.forces, u, fraction, state, laws), held)
-        tangent = problem.tangent(it.x, fraction, state, laws)
+        points = problem.locate(u, fraction, bends=True)
+        laws = problem.tangent_laws(points, state, it.contact, curvature)
+        r = problem.residual(problem.with_contact(it.forces, points, fraction, state, laws), held)
+        tangent = problem.tangent(it.x, fraction, state, laws, points=points)
         solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
         change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
         return it._replace(
             direction=solution.x._replace(u=change),
-            contact=problem.follow(u, change, fraction, state, laws),
+            contact=problem.follow(points, change, state, laws),
             steps=it.steps + 1,
             krylov=it.krylov + solution.iterations,
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),

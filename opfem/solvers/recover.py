@@ -12,7 +12,6 @@ from ..mechanics.face import (
     filled_vertices,
     nodal_area_vector,
     size,
-    surface_tangents,
     to_corners,
     tributary_area,
 )
@@ -88,13 +87,13 @@ def _face(
         return FaceResult(pressure, traction, slip, status), {"approach": zero, "max_penetration": zero}
     corners = take(problem.positions + state.u, body, with_sides=False)
     old, new = (jax.tree.map(lambda v: v[..., : corners.shape[-1]] if v.ndim else v, history) for history in (old, new))
-    position, xi, eta = surface_tangents(corners, face.rule)
+    points = face.locate(state.fraction, corners)
 
     def on_nodes(values):
         return filled(to_touching(to_corners(values, face.rule), problem.elements).face)
 
-    point = face.at_points(state.fraction, position, old)
-    weight = size(area_vector(xi, eta))
+    point = face.at_points(points, old)
+    weight = size(area_vector(*points.tangents))
     weight = weight if face.shares is None else weight * face.shares[:, : weight.shape[1]]
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
     share = on_nodes(jnp.stack([weight, load, load * point.slips], axis=1))

@@ -157,5 +157,3 @@ def mask_stencil(free: np.ndarray) -> np.ndarray:
     offsets = itertools.product(range(3), repeat=3)
     around = np.stack([padded[:, z : z + mz, y : y + my, x : x + mx] for z, y, x in offsets])
     return around.reshape(3, 9, 1, *free.shape) * free[:, None]
-
-

@@ -108,6 +108,6 @@ def test_a_side_feels_only_the_surface_that_it_has_turned_towards(above):
         strip = jnp.array(np.stack([x, y, z + sign * (overclosure if above else overclosure + 0.001)]))
         strip = gather_face(strip).reshape(4, 3, 1)
         face = side_face(above)
-        force = np.asarray(face.force(jnp.ones(()), strip, face.initial_history(strip))).sum(axis=(0, 2))
+        force = np.asarray(face.force(face.locate(jnp.ones(()), strip), face.initial_history(strip))).sum(axis=(0, 2))
         depth = overclosure + 0.0005
         np.testing.assert_allclose(force, [0, 0, -sign * 7.0 * depth * max(lean, 0.0)], 1e-9, ROUNDOFF)

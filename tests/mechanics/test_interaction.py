@@ -26,15 +26,17 @@ SIDES = pytest.mark.parametrize("above", [True, False], ids=["sample", "window"]
 RULES = pytest.mark.parametrize("rule", ["gauss2", "gauss3", "nodes"])
 
 
+def located(face, x):
+    return face.locate(NOW, gather_face(x), bends=True)
+
+
 def nodal_force(face, x, history, law=None):
-    return assemble_face(face.force(NOW, gather_face(x), history, law))
+    return assemble_face(face.force(face.locate(NOW, gather_face(x)), history, law))
 
 
 _force = eqx.filter_jit(nodal_force)
-_matrices = eqx.filter_jit(
-    lambda face, x, history, law=None: face.stiffness_matrices(NOW, gather_face(x), history, law)
-)
-_advance = eqx.filter_jit(lambda face, x, history: face.advance(NOW, gather_face(x), history))
+_matrices = eqx.filter_jit(lambda face, x, history, law=None: face.stiffness_matrices(located(face, x), history, law))
+_advance = eqx.filter_jit(lambda face, x, history: face.advance(located(face, x), history))
 _jacobian = eqx.filter_jit(lambda face, x, history: jax.jacfwd(lambda v: nodal_force(face, v, history))(x))
 
 
@@ -181,7 +183,7 @@ def bumpy_state(state, rough):
 @pytest.mark.parametrize("state", STATES)
 def test_stiffness_is_minus_the_derivative_of_force_on_a_curved_surface(state, rough):
     face, x, history = bumpy_state(state, rough)
-    point = face.at_points(NOW, _points(face, x), history)
+    point = face.at_points(located(face, x), history)
     assert np.all(point.pressure > 0)
     share = {"sliding": 1.0, "frictionless": 1.0, "sticking": 0.0, "at rest": 0.0}.get(state)
     assert np.mean(point.sliding) == share if share is not None else 0.2 < np.mean(point.sliding) < 0.8
@@ -308,8 +310,8 @@ def _iterate(pressure, history):
 @pytest.mark.parametrize("state", ["sticking", "sliding"])
 def test_law_linearised_at_its_own_pressure_changes_nothing(state, rough):
     face, x, history = bumpy_state(state, rough)
-    point = face.at_points(NOW, _points(face, x), history)
-    law = face.tangent_law(NOW, gather_face(x), history, _iterate(point.pressure, history), jnp.ones(()))
+    point = face.at_points(located(face, x), history)
+    law = face.tangent_law(located(face, x), history, _iterate(point.pressure, history), jnp.ones(()))
     assert isinstance(law, TangentLaw)
     own, linear = _force(face, x, history), _force(face, x, history, law)
     np.testing.assert_allclose(linear, own, 10 * ROUNDOFF, 10 * ROUNDOFF * np.abs(own).max())
@@ -323,7 +325,7 @@ def test_linearised_law_is_the_tangent_at_the_iterates_pressure():
     x = jnp.array(flat(0.009))
     history = face.initial_history(gather_face(x))
     start = _iterate(jnp.full_like(history.pressure, 0.02), history)
-    law = face.tangent_law(NOW, gather_face(x), history, start, jnp.ones(()))
+    law = face.tangent_law(located(face, x), history, start, jnp.ones(()))
     low, high = 0.0, 1.0
     for _ in range(200):  # bisection for the s of this pressure
         s = (low + high) / 2
@@ -340,12 +342,12 @@ def test_pressure_follows_the_clearance_over_a_step():
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.0))
     x = jnp.array(flat(-0.01))
     history = _advance(face, x, face.initial_history(gather_face(x)))
-    law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
+    law = face.tangent_law(located(face, x), history, face.initial_iterate(history), jnp.ones(()))
     change = moved(np.zeros(x.shape), z=-0.004)
     for length in (1.0, 0.5):
-        after = face.follow(NOW, gather_face(x), gather_face(change), history, law).after(jnp.asarray(length))
+        after = face.follow(located(face, x), gather_face(change), history, law).after(jnp.asarray(length))
         np.testing.assert_allclose(after.pressure, 7.0 * (0.01 + 0.004 * length), ROUNDOFF)
-    opened = face.follow(NOW, gather_face(x), gather_face(moved(np.zeros(x.shape), z=0.1)), history, law)
+    opened = face.follow(located(face, x), gather_face(moved(np.zeros(x.shape), z=0.1)), history, law)
     np.testing.assert_array_equal(opened.after(jnp.asarray(1.0)).pressure, 0.0)
 
 
@@ -354,10 +356,10 @@ def test_a_sliding_point_that_reverses_sticks_for_one_step(back, sticks):
     face = contact_face(op.Contact(op.LinearOverclosure(7.0), friction=0.3, elastic_slip=1e-3))
     x = jnp.array(flat(-0.01))
     history = _advance(face, x, face.initial_history(gather_face(x)))
-    law = face.tangent_law(NOW, gather_face(x), history, face.initial_iterate(history), jnp.ones(()))
-    slid = face.follow(NOW, gather_face(moved(x, x=0.02)), gather_face(jnp.zeros_like(x)), history, law)
+    law = face.tangent_law(located(face, x), history, face.initial_iterate(history), jnp.ones(()))
+    slid = face.follow(located(face, moved(x, x=0.02)), gather_face(jnp.zeros_like(x)), history, law)
     np.testing.assert_allclose(slid.direction[0], 1e-3, ROUNDOFF)
-    following = face.tangent_law(NOW, gather_face(moved(x, x=back)), history, slid, jnp.ones(()))
+    following = face.tangent_law(located(face, moved(x, x=back)), history, slid, jnp.ones(()))
     assert np.all(following.sticks == sticks)
 
 
