@@ -82,7 +82,7 @@ def test_transfer_reproduces_table_b():
     assert transfer(3.0, 0.475, False) == pytest.approx(0.525 * 0.322104, abs=1e-6)
 
 
-@pytest.mark.parametrize("window", ["bonded", "roller"])
+@pytest.mark.parametrize("window", ["bonded", pytest.param("roller", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kh", [1.0, 3.0])
 def test_17_18_transfer_function(kh, window):
     """VALIDATION.md tests 17 and 18, half a wavelength between rollers: 40 elements per wavelength, 16 deep."""

@@ -127,7 +127,7 @@ def test_start_continues_with_history():
     [
         (op.Traction(2e-3), {}),
         pytest.param(op.Traction(2e-3, lateral=np.zeros((2, 7, 7))), {}, marks=pytest.mark.slow),
-        (op.Displacement(-0.05, lateral="fixed"), {"sample": op.Bonded()}),
+        pytest.param(op.Displacement(-0.05, lateral="fixed"), {"sample": op.Bonded()}, marks=pytest.mark.slow),
         pytest.param(
             op.Displacement(-0.05, lateral="free"), {"sample": op.Roller(), "sides": "roller"}, marks=pytest.mark.slow
         ),
