@@ -1,5 +1,7 @@
-"""Turns on what every test relies on: checked annotations, 64-bit numbers, and the shared reference data."""
+"""Turns on what every test relies on: checked annotations, 64-bit numbers, kept programs, and the reference data."""
 
+import os
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -16,27 +18,44 @@ matplotlib.use("agg")
 
 # After the hook, which checks only what is imported later.
 import opfem as op  # noqa: E402
+from tests.experiments import EXTENT, L0, PIXELS, published_palpation  # noqa: E402
+from tests.sharding import (  # noqa: E402
+    pytest_addoption as pytest_addoption,
+    pytest_collection_modifyitems as pytest_collection_modifyitems,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+# In the environment for the processes that tests start, too.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
+op.cache_compilation()
+
+# Linux lets a process map 65 530 regions of memory; beyond, jaxlib crashes. XLA maps some 2000 for a compiled solve,
+# and one test compiles at most a dozen.
+_MOST_REGIONS = 30_000
+# A test that compiles a solve, or loads one, takes longer [s].
+_COMPILES = 0.5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_code_is_released():
-    """XLA maps thousands of memory regions per compiled solve; Linux allows a process 65 530, then jaxlib crashes."""
-    yield
-    jax.clear_caches()
+def _regions() -> int:
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return _MOST_REGIONS + 1  # not Linux: unknown
 
 
 @pytest.fixture(autouse=True)
-def _compiled_code_of_a_slow_test_is_released(request):
-    """A module of derivatives alone compiles more than a process may map."""
+def _compiled_code_is_released():
+    """Forget compiled programs when they are many; the next test that needs one loads it from disk."""
+    begin = time.monotonic()
     yield
-    if request.node.get_closest_marker("slow"):
+    if time.monotonic() - begin > _COMPILES and _regions() > _MOST_REGIONS:
         jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of reference data that is kept outside the repository, beside its root."""
-    folder = Path(__file__).resolve().parents[2] / "shared"
+    folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("needs the reference data in the folder `shared` beside the repository; it is not there")
     return folder
@@ -45,24 +64,17 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def loaded():
     """A gentle bump pressed 13% into a 0.5 mm layer, off centre, with one missing pixel that is filled."""
-    x, y = np.meshgrid(np.linspace(0.0, 2.0, 21), np.linspace(0.0, 2.0, 17))
-    thickness = 0.5 * (1 - 0.07 - 0.06 * np.exp(-((x - 1.2) ** 2 + (y - 0.8) ** 2) / 0.3))
+    x, y = np.meshgrid(np.linspace(0.0, EXTENT[0], PIXELS[1]), np.linspace(0.0, EXTENT[1], PIXELS[0]))
+    thickness = L0 * (1 - 0.07 - 0.06 * np.exp(-((x - 1.2) ** 2 + (y - 0.8) ** 2) / 0.3))
     mask = np.zeros(x.shape, bool)
     mask[3, 4] = True
-    return op.ThicknessMap(thickness, extent=(2.0, 2.0), std=0.002, mask=mask).filled().smoothed(fwhm=0.2)
+    return op.ThicknessMap(thickness, extent=EXTENT, std=0.002, mask=mask).filled().smoothed(fwhm=0.2)
 
 
 @pytest.fixture(scope="session")
 def solution(loaded):
     """The bump pressed into a 2 × 2 mm layer on 6 × 6 × 2 elements, with friction on both sides."""
-    palpation = op.Palpation(
-        op.Layer(0.5, op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=0.11732)),
-        extent=(2.0, 2.0),
-        elements=(6, 6, 2),
-        window=op.Contact(op.HardOverclosure(), friction=0.15),
-        sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), friction=0.05),
-    )
-    return op.solve(palpation, op.Imprint(loaded))
+    return op.solve(published_palpation(), op.Imprint(loaded))
 
 
 @pytest.fixture(scope="session")

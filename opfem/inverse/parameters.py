@@ -104,7 +104,7 @@ def check_parameters(palpation: Palpation, parameters: Mapping[str, Any]) -> Non
             value = _field(palpation, name)
         except AttributeError:
             value = None
-        if not eqx.is_inexact_array(value) or value.ndim != 0:
+        if value is None or not eqx.is_inexact_array(value) or value.ndim != 0:
             raise ValueError(
                 f"fit_traction: parameters name numbers of the experiment by their path, such as 'layer.material.c10', "
                 f"'window.friction', or {INDEX!r} and {OFFSET!r}; got {name!r}."

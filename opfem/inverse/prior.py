@@ -41,11 +41,11 @@ class AbstractPrior(eqx.Module):
         """Compute the standard deviation of every orthonormal cosine mode [MPa]."""
         raise NotImplementedError
 
-    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Nodes | Array:
+    def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Nodes | Array:
         """Compute what nodal values are multiplied with after the cosine transform [-]."""
         raise NotImplementedError
 
-    def penalised(self, shape: tuple[int, int]) -> np.ndarray:
+    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
         """Tell how firmly the prior holds white unknowns near zero: 1, or `_HARDLY` where it says nothing."""
         return np.ones(shape)
 
@@ -109,7 +109,7 @@ class Matern(AbstractPrior):
         # The mean variance over the nodes is std².
         return self.std * jnp.sqrt(density * k.size / jnp.sum(density))
 
-    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Nodes:
+    def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Nodes:
         """Compute what nodal values are multiplied with, so that all have the same standard deviation [-]."""
         variance = self.mode_std(wave_numbers(shape, spacing), spacing) ** 2
         for axis in (0, 1):
@@ -150,11 +150,11 @@ class Tikhonov(AbstractPrior):
         unit = 1.0 / (self.weight * jnp.sqrt(hx * hy))
         return unit * jnp.where(k > 0, jnp.where(k > 0, k, 1.0) ** -float(self.order), lowest**-self.order)
 
-    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Array:
+    def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Array:
         """Compute what nodal values are multiplied with: 1."""
         return jnp.ones(())
 
-    def penalised(self, shape: tuple[int, int]) -> np.ndarray:
+    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
         """Tell how firmly the prior holds white unknowns near zero: all but the mean."""
         held = np.ones(shape)
         held[0, 0] = _HARDLY
@@ -189,17 +189,17 @@ class TotalVariation(AbstractPrior):
 
     @property
     def _smooth(self) -> Tikhonov:
-        return Tikhonov(1, jnp.sqrt(self.weight / self.slope))
+        return Tikhonov(order=1, weight=jnp.sqrt(self.weight / self.slope))
 
     def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
         """Compute the standard deviation of every orthonormal cosine mode [MPa] where the pressure is smooth."""
         return self._smooth.mode_std(k, spacing)
 
-    def scale(self, shape: tuple[int, int], spacing: Spacing) -> Array:
+    def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Array:
         """Compute what nodal values are multiplied with: 1."""
         return jnp.ones(())
 
-    def penalised(self, shape: tuple[int, int]) -> np.ndarray:
+    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
         """Tell how firmly the prior holds white unknowns near zero where the pressure is smooth: all but the mean."""
         return self._smooth.penalised(shape)
 

@@ -157,10 +157,11 @@ class TractionFit(eqx.Module):
         half = float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * coverage))
         spread = dict(zip(self.misfit.parameters, jnp.sqrt(jnp.diag(self.number_covariance)), strict=True))
         white = self.posterior.white.numbers
-        return {
-            name: tuple(float(prior.number(white[name] + sign * half * spread[name])) for sign in (-1.0, 1.0))
-            for name, prior in self.misfit.parameters.items()
-        }
+
+        def end(name, prior, sign):
+            return float(prior.number(white[name] + sign * half * spread[name]))
+
+        return {name: (end(name, prior, -1.0), end(name, prior, 1.0)) for name, prior in self.misfit.parameters.items()}
 
     def not_identified(self, within: float = 0.25) -> dict[str, float]:
         """Name fitted numbers that the data do not tell to a part of their value.

@@ -40,4 +40,4 @@ def on_mesh(start: ArrayLike, maps: int, my: int, mx: int) -> Float[Array, "maps
             f"maps, such as {(my, mx)}; got shape {np.shape(start)}."
         )
     factors = my / each.shape[1], mx / each.shape[2]
-    return jnp.stack([zoom(one, factors, order=3, mode="mirror") for one in each])
+    return jnp.asarray(np.stack([np.asarray(zoom(one, factors, order=3, mode="mirror")) for one in each]))

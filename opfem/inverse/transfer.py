@@ -63,7 +63,7 @@ def transfer_function(
     return per_shear * thickness / shear
 
 
-def wave_numbers(shape: tuple[int, int], spacing: tuple[ScalarLike, ScalarLike]) -> Float[Array, "my mx"]:
+def wave_numbers(shape: tuple[int, ...], spacing: tuple[ScalarLike, ScalarLike]) -> Float[Array, "my mx"]:
     """Compute the wave number [1/mm] of every mode of a two-dimensional cosine transform on nodes."""
     (my, mx), (hx, hy) = shape, spacing
     ky = jnp.pi * jnp.arange(my) / (my * hy)

@@ -46,9 +46,9 @@ class Checkpoint:
             inputs: What the solve was given.
             state: Any PyTree of arrays.
         """
-        arrays = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
+        arrays: dict[str, Any] = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
         with whole_file(self.path) as temporary:
-            np.savez(temporary, **{_HASH: np.array(inputs_hash(inputs=inputs))}, **arrays)
+            np.savez(temporary, **{_HASH: np.array(inputs_hash(inputs=inputs)), **arrays})
 
     def restore(self, inputs: Any, like: Any) -> Any:
         """Read the state; None where there is no file.

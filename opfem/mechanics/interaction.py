@@ -303,10 +303,11 @@ class ContactFace(eqx.Module):
 
         Slopes are by clearance; by height under an imposed pressure.
         """
-        if self.imposed is not None:
+        imposed = self.imposed
+        if imposed is not None:
             z = points.position[2]
-            push, slope = jax.jvp(lambda z: self.imposed.springs(points.fraction, z), (z,), (jnp.ones_like(z),))
-            pressure = self.imposed.bounding(points.fraction, self.rule, push)
+            push, slope = jax.jvp(lambda z: imposed.springs(points.fraction, z), (z,), (jnp.ones_like(z),))
+            pressure = imposed.bounding(points.fraction, self.rule, push)
             return pressure, push, jnp.where(pressure > 0, slope, 0.0), slope
         pressure, slope = jax.jvp(law, (clearance,), (jnp.ones_like(clearance),))
         return pressure, pressure, slope, slope

@@ -6,6 +6,8 @@ stress is a closed form of the displacement gradient, so that float32 keeps its 
 """
 
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 from typing import Any
 
 import equinox as eqx
@@ -74,6 +76,7 @@ class LayerForce(eqx.Module):
 
     def _of_rows(self, u: Nodal, extra_stress: Callable, fields: Any) -> tuple[Nodal, Cells]:
         cells, material = self.body.cells, self.body.material
+        assert isinstance(material, AbstractInvariantMaterial)  # `_is_fast` has seen to it
         H = self._gradient(u)
         change = _keep(_volume_change(H))
         weight = None if self.uniform else _by_axes(cells.weight)
@@ -106,7 +109,7 @@ class LayerForce(eqx.Module):
         """Sum P[i, J] dN_a/dX_J over the points, into nodes: the transpose of `_gradient`."""
         cells = self.body.cells
         hx, hy = cells.spacing
-        if self.uniform:
+        if weight is None:
             volume = cells.weight[0, 0, 0, 0]
             fx, fy, fz = volume / hx, volume / hy, volume / cells.depth[0, 0, 0, 0]
         else:
@@ -191,7 +194,7 @@ def _volume_change(H: Gradient) -> Array:
     """Compute J - 1 without cancellation."""
     minors = _minors(H)
     determinant = sum(H[0][k] * minors[0][k] for k in range(3))
-    return sum(H[i][i] + minors[i][i] for i in range(3)) + determinant
+    return reduce(add, (H[i][i] + minors[i][i] for i in range(3))) + determinant
 
 
 def _cauchy_green_change(H: Gradient) -> Gradient:
@@ -208,9 +211,9 @@ def _by_axes(values: Float[Array, "8 _ ny nx"]) -> Float[Array, "2 2 2 _ ny nx"]
 
 def _point_mean(values: Array, weight: Array | None) -> Cells:
     if weight is None:
-        return sum(values[q] for q in _POINTS) / 8.0
-    total = sum(weight[q] for q in _POINTS)
-    return sum(values[q] * weight[q] for q in _POINTS) / total
+        return reduce(add, (values[q] for q in _POINTS)) / 8.0
+    total = reduce(add, (weight[q] for q in _POINTS))
+    return reduce(add, (values[q] * weight[q] for q in _POINTS)) / total
 
 
 _POINTS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]

@@ -84,8 +84,8 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         if load.lateral is None or bed is not None:
             at, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
             start_normal, end_normal = (gather_face(-end[2:]).reshape(4, -1) for end in (first, last))
-            springs = () if bed is None else (at[2], bed)
-            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), *springs)
+            rest = None if bed is None else at[2]
+            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), rest, bed)
             contact = _contact(palpation.sample)
             if load.lateral is not None:
                 contact = dataclasses.replace(contact, friction=0.0)

@@ -227,10 +227,10 @@ def prepare(
     )
     if first is None:
         return dynamics, dynamics.at_rest()
-    first = _cast(first, dtype)
+    begun: Motion = _cast(first, dtype)
     rest = dynamics.at_rest()
-    damped = None if rest.damped is None else (rest.damped if first.damped is None else first.damped)
-    return dynamics, dataclasses.replace(first, time=rest.time, damped=damped)
+    damped = None if rest.damped is None else (rest.damped if begun.damped is None else begun.damped)
+    return dynamics, dataclasses.replace(begun, time=rest.time, damped=damped)
 
 
 def _may_need_hold(palpation: Palpation) -> bool:

@@ -147,7 +147,7 @@ def touch(
     return added, FaceMotion(clearance, normal_force, friction, slip, slips, work)
 
 
-def imposed_force(face: ContactFace, fraction: Array, shape: tuple[int, int]) -> Face:
+def imposed_force(face: ContactFace, fraction: Array, shape: tuple[int, ...]) -> Face:
     """Compute the dead normal force of a node [N] that bounds its friction."""
     assert face.imposed is not None
     ny, nx = shape[0] - 1, shape[1] - 1

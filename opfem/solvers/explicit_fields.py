@@ -45,11 +45,13 @@ def recover_motion(dynamics: Dynamics, m: Motion, load: Load) -> Fields:
     }
     _, stress, _ = dynamics.force.body.fields(u)
     top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
-    faces = (
-        _face(dynamics, body, motion, u, force)
-        for body, motion, force in (("sample", m.sample, sample), ("window", m.window, window))
+    return Fields(
+        _face(dynamics, "sample", m.sample, u, sample),
+        _face(dynamics, "window", m.window, u, window),
+        deformed_thickness(problem, u, load),
+        top,
+        stats,
     )
-    return Fields(*faces, deformed_thickness(problem, u, load), top, stats)
 
 
 def _face(dynamics: Dynamics, body: Body, motion: FaceMotion | None, u: Array, force: Array) -> FaceResult:

@@ -128,7 +128,8 @@ class Dynamics(eqx.Module):
         dt = jnp.asarray(dt, dtype)
         mean = 0.5 * (m.last + dt)  # between the middles of the last and of this increment
         end_time = m.time + dt
-        travel = Travel(*(self.fraction(t) for t in (m.time - m.last, m.time, end_time)), dt, mean / dt)
+        earlier, now = self.fraction(m.time - m.last), self.fraction(m.time)
+        travel = Travel(earlier, now, self.fraction(end_time), dt, mean / dt)
         before = jnp.where(m.last > 0, m.last, 1.0)  # nothing has moved before the first increment
 
         internal, change = self.force(
@@ -151,9 +152,9 @@ class Dynamics(eqx.Module):
             below, window = self._touch("window", m, None, below, mobility, travel)
         if problem.contacts.sample is not None:
             above, sample = self._touch("sample", m, under, above, mobility, travel)
-        if problem.dead is not None:
+        if problem.dead is not None and loaded is not None:
             loaded = loaded + 0.5 * mean * jnp.sum(dead * (m.v[:, -1] + above / dt), axis=0)
-        if problem.imposed is not None:
+        if problem.imposed is not None and loaded is not None:
             low, high = problem.imposed
             needed = (1.0 - travel.end) * low + travel.end * high - m.u[2, -1]
             pushed = (needed - above[2]) / mobility[-1]
@@ -165,7 +166,7 @@ class Dynamics(eqx.Module):
         bulk = self.viscosity(change, m.change, before)
         viscous = m.viscous + 0.5 * (m.bulk + bulk) * (change - m.change) * self.force.body.cells.volume[0]
         damped = m.damped
-        if self.damping is not None:
+        if self.damping is not None and damped is not None:
             damped = damped + 0.25 * mean * self.damping * self.mass * jnp.sum((v + m.v) ** 2, axis=0)
         return Motion(u, v, change, bulk, window, sample, hold, viscous, damped, loaded, end_time, dt)
 

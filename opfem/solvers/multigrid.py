@@ -7,7 +7,8 @@ Interpolation to the finest grid lets heights follow lateral motion along a tilt
 An odd count of elements is padded with an empty one, so any mesh coarsens.
 """
 
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import NamedTuple
 
 import jax
@@ -172,7 +173,7 @@ def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
         none = jnp.zeros_like(push)
         return jax.lax.fori_loop(0, _LEANING_STEPS, move, (none, push, none))[0]
 
-    push = sum(-S[dz, d, 2, :2] for dz in range(3) for d in range(9))
+    push = reduce(add, (-S[dz, d, 2, :2] for dz in range(3) for d in range(9)))
     return jax.vmap(settle)(push[:, None])[:, 0]
 
 

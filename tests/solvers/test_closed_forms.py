@@ -5,9 +5,11 @@ import pytest
 from scipy.optimize import brentq
 
 import opfem as op
+from tests.experiments import flat_map, published_palpation
 
 C10, C01, BULK = 2.2e-3, 7.03e-4, 0.11612  # MPa; VALIDATION.md, MR20
 MATERIAL = op.MooneyRivlin(c10=C10, c01=C01, bulk=BULK)
+WIDE = (5.0, 5.0)  # mm
 
 
 def cauchy(axial: float, lateral: float) -> np.ndarray:
@@ -31,13 +33,9 @@ SLOW = [pytest.param(element, marks=pytest.mark.slow) for element in ("full", "r
 @pytest.mark.parametrize("sides", ["free", "roller"])
 def test_07_08_uniform_compression(sides, element):
     """VALIDATION.md tests 7 and 8: lubricated and confined compression."""
-    contact = op.Contact(op.HardOverclosure(), 0.0)
-    sample = op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.0)
-    layer = op.Layer(0.5, MATERIAL)
-    palpation = op.Palpation(layer, (5.0, 5.0), (4, 4, 2), contact, sample, sides=sides, element=element)
+    palpation = published_palpation(0.0, 0.0, MATERIAL, extent=WIDE, sides=sides, element=element)
     for stretch in (0.9, 0.8, 0.7, 0.6, 0.5):
-        flat = op.ThicknessMap(np.full((5, 5), 0.5 * stretch), extent=(5.0, 5.0))
-        solution = op.solve(palpation, op.Imprint(flat))
+        solution = op.solve(palpation, op.Imprint(flat_map(0.5 * stretch, WIDE)))
         u = np.asarray(solution.displacement)
         reached = 1.0 + float(np.mean(u[2, -1] - u[2, 0])) / 0.5
         sunk = float(solution.stats["max_penetration"]) / 0.5  # into the window: elements are flat
@@ -51,20 +49,18 @@ def test_07_08_uniform_compression(sides, element):
 
 def test_30_friction_bracket():
     """VALIDATION.md test 30: the force between flat plates rises from free spreading to a bonded layer."""
-    layer, size, elements = op.Layer(0.5, MATERIAL), (5.0, 5.0), (4, 4, 2)
-    flat = op.Imprint(op.ThicknessMap(np.full((5, 5), 0.45), extent=size))
-    solutions = []
-    for friction in (0.0, 0.01, 0.05, 0.12, 0.3, 1.0):
-        window = op.Contact(op.HardOverclosure(), friction)
-        sample = op.Contact(op.ExponentialOverclosure(2.0, 0.01), friction)
-        solutions.append(op.solve(op.Palpation(layer, size, elements, window, sample), flat))
+    flat = op.Imprint(flat_map(0.45, WIDE))
+    solutions = [
+        op.solve(published_palpation(friction, friction, MATERIAL, extent=WIDE), flat)
+        for friction in (0.0, 0.01, 0.05, 0.12, 0.3, 1.0)
+    ]
     forces = np.array([-float(s.stats["force_sample"][2]) for s in solutions])
     assert np.all(np.diff(forces) > 0)
     shortened = [-float(np.mean(s.displacement[2, -1] - s.displacement[2, 0])) for s in solutions]
     stretch = 1 - shortened[0] / 0.5
     lateral = brentq(lambda t: cauchy(stretch, t)[0], 0.99, 2.0)
     assert forces[0] == pytest.approx(-cauchy(stretch, lateral)[2] * 25 * lateral**2, rel=1e-6)
-    bonded = op.Palpation(layer, size, elements, op.Bonded(), op.Bonded())
+    bonded = published_palpation(op.Bonded(), op.Bonded(), MATERIAL, extent=WIDE)
     held = op.solve(bonded, op.Displacement(-shortened[-1], lateral="fixed"))
     assert forces[-1] == pytest.approx(-float(held.stats["force_sample"][2]), rel=0.02)
     slip = [float((s.contact_status == 2).mean()) for s in solutions]
@@ -86,7 +82,7 @@ def test_transfer_reproduces_table_b():
     assert transfer(3.0, 0.475, False) == pytest.approx(0.525 * 0.322104, abs=1e-6)
 
 
-@pytest.mark.parametrize("window", ["bonded", "roller"])
+@pytest.mark.parametrize("window", ["bonded", pytest.param("roller", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kh", [1.0, 3.0])
 def test_17_18_transfer_function(kh, window):
     """VALIDATION.md tests 17 and 18, half a wavelength between rollers: 40 elements per wavelength, 16 deep."""
@@ -117,9 +113,7 @@ def test_traction_with_friction_resists_spreading():
     """A uniform traction with friction spreads less than without, and comes back as it went in."""
     shapes = {}
     for friction in (0.0, 0.3):
-        contact = op.Contact(op.HardOverclosure(), friction)
-        palpation = op.Palpation(op.Layer(0.5, MATERIAL), (2.0, 2.0), (6, 6, 2), contact, contact)
-        solution = op.solve(palpation, op.Traction(2e-3))
+        solution = op.solve(published_palpation(friction, friction), op.Traction(2e-3))
         np.testing.assert_allclose(solution.traction[2], -2e-3, rtol=1e-9)
         lateral = np.hypot(*np.asarray(solution.traction[:2]))
         assert lateral.max() <= friction * 2e-3 * (1 + 1e-9)
@@ -128,9 +122,6 @@ def test_traction_with_friction_resists_spreading():
 
 
 def test_uniform_frictionless_layer_needs_no_hold():
-    contact = op.Contact(op.HardOverclosure(), 0.0)
-    palpation = op.Palpation(op.Layer(0.5, MATERIAL), (1.0, 1.0), (4, 4, 1), contact, contact)
-    flat = op.ThicknessMap(np.full((3, 3), 0.45), extent=(1.0, 1.0))
-    solution = op.solve(palpation, op.Imprint(flat))
+    solution = op.solve(published_palpation(0.0, 0.0), op.Imprint(flat_map(0.45)))
     assert bool(solution.result == op.RESULTS.successful)
     assert np.abs(np.asarray(solution.stats["force_hold"])).max() < 1e-10

@@ -122,7 +122,6 @@ CASES["tet10"] = Case(
     {name: FRICTIONAL[name] for name in ("L0", "c10", "c01", "bulk", "extent")},
 )
 CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
-SLOW = {name: [pytest.mark.slow] for name in CASES if name != "friction on both sides"}
 
 
 @partial(jax.jit, static_argnums=0)
@@ -141,31 +140,56 @@ def relative(numbers: Numbers, seed: int) -> Numbers:
     return {name: value * rng.uniform(-1, 1, np.shape(value)) for name, value in numbers.items()}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW.get(name, ())) for name in CASES])
+def difference(solve: Callable[[Numbers], op.Solution], numbers: Numbers, change: Numbers, step: float) -> float:
+    """Central difference when numbers change together."""
+    ends = [
+        float(measure(solve({**numbers, **{name: numbers[name] + sign * step * v for name, v in change.items()}})))
+        for sign in (1, -1)
+    ]
+    return (ends[0] - ends[1]) / (2 * step)
+
+
+def assert_forward_equals_reverse(forward, gradient: Numbers, direction: Numbers, rtol: float = 1e-8):
+    """Linear solves end at 1e-10."""
+    terms = [float(jnp.vdot(gradient[number], direction[number])) for number in gradient]
+    assert abs(sum(terms) - float(forward)) <= rtol * np.abs(terms).sum()
+
+
+def assert_is_a_central_difference(derivative, solve, numbers: Numbers, change: Numbers):
+    differences = []
+    for step in STEPS:
+        differences.append(difference(solve, numbers, change, step))
+        if differences[-1] == pytest.approx(float(derivative), rel=FINITE_DIFFERENCE, abs=1e-8):
+            return
+    pytest.fail(f"{', '.join(change)}: derivative {derivative}, central differences {differences}")
+
+
+def test_derivative_along_a_direction_equals_central_differences_and_forward_equals_reverse():
+    """All numbers change together, each by its own size; one at a time below."""
+    solve, numbers = CASES["friction on both sides"]
+    numbers = jax.tree.map(jnp.asarray, numbers)
+    direction = relative(numbers, 1)
+    value, forward, gradient = forward_and_reverse(solve, numbers, direction)
+    np.testing.assert_allclose(value, measure(solve(numbers)), SOLVER)
+    assert_forward_equals_reverse(forward, gradient, direction)
+    assert_is_a_central_difference(forward, solve, numbers, direction)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
     solve, numbers = CASES[name]
     numbers = jax.tree.map(jnp.asarray, numbers)
     direction = relative(numbers, 1)
     value, forward, gradient = forward_and_reverse(solve, numbers, direction)
     np.testing.assert_allclose(value, measure(solve(numbers)), SOLVER)
-    terms = [float(jnp.vdot(gradient[number], direction[number])) for number in numbers]
-    # Linear solves end at 1e-10. Hard contact carries pressure: the error of a gap, times 100 stiffnesses.
-    agreement = 1e-7 if name == "hard contact" else 1e-8
-    assert abs(sum(terms) - float(forward)) <= agreement * np.abs(terms).sum()
-    frictionless = name == "no friction"
+    # Hard contact carries pressure: the error of a gap, times 100 stiffnesses.
+    assert_forward_equals_reverse(forward, gradient, direction, 1e-7 if name == "hard contact" else 1e-8)
     for number, value in numbers.items():
-        if frictionless and number.endswith("friction"):
+        if name == "no friction" and number.endswith("friction"):
             continue  # friction cannot be negative
         change = relative(numbers, 2)[number] if value.ndim else value
-        expected = float(jnp.vdot(gradient[number], change))
-        differences = []
-        for step in STEPS:
-            ends = [float(measure(solve({**numbers, number: value + sign * step * change}))) for sign in (1, -1)]
-            differences.append((ends[0] - ends[1]) / (2 * step))
-            if differences[-1] == pytest.approx(expected, rel=FINITE_DIFFERENCE, abs=1e-8):
-                break
-        else:
-            pytest.fail(f"{number}: derivative {expected}, central differences {differences}")
+        assert_is_a_central_difference(jnp.vdot(gradient[number], change), solve, numbers, {number: change})
 
 
 @pytest.mark.slow

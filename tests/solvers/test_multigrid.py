@@ -226,8 +226,8 @@ def _solve(K, b, mask):
 
 @pytest.mark.parametrize(
     ("elements", "extent", "bonded"),
-    [((8, 8, 2), (5.0, 5.0), True), ((13, 7, 3), (5.0, 2.7), True), ((20, 2, 16), (2.5, 0.25), False)],
-    ids=["8x8x2", "13x7x3", "20x2x16 on a roller"],
+    [((13, 7, 3), (5.0, 2.7), True), ((20, 2, 16), (2.5, 0.25), False)],
+    ids=["13x7x3", "20x2x16 on a roller"],
 )
 def test_a_thin_layer_converges_in_few_iterations(elements, extent, bonded):
     """A random load, so that every frequency is in it, to 1e-8: 32 to 37 when this was written."""

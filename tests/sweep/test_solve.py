@@ -6,35 +6,26 @@ import numpy as np
 import pytest
 
 import opfem as op
+from tests.experiments import MATERIAL, published_palpation
 from tests.tolerances import FINITE_DIFFERENCE, SOLVER
 
 C10, FRICTION = (-1e-3, 2e-3, 4e-3), (0.0, 0.2)  # a negative modulus cannot be solved
 KEEP = ("max_pressure", "pressure", "slip", "stress_zz", "contact_status", "thickness", "force_sample", "newton_steps")
-BULK = 0.11732
+
+
+def palpation(c10, friction):
+    return published_palpation(friction, material=op.MooneyRivlin(c10, MATERIAL.c01, MATERIAL.bulk))
 
 
 @pytest.fixture(scope="module")
-def palpation(solution):
-    def state(c10, friction):
-        material = op.MooneyRivlin(c10=c10, c01=7.03e-4, bulk=BULK)
-        window = op.Contact(op.HardOverclosure(), friction)
-        base = solution.palpation
-        return op.Palpation(
-            op.Layer(0.5, material), extent=(2.0, 2.0), elements=base.elements, window=window, sample=base.sample
-        )
-
-    return state
-
-
-@pytest.fixture(scope="module")
-def data(palpation, loaded):
+def data(loaded):
     def pressed(c10, friction):
         return op.solve(palpation(c10, friction), op.Imprint(loaded), throw=False)
 
     return op.sweep(pressed, {"c10": C10, "friction": FRICTION}, keep=KEEP, units={"c10": "MPa", "friction": "1"})
 
 
-def test_each_point_is_what_one_solve_gives(data, palpation, loaded):
+def test_each_point_is_what_one_solve_gives(data, loaded):
     for c10 in C10[1:]:
         for friction in FRICTION:
             alone = op.to_xarray(op.solve(palpation(c10, friction), op.Imprint(loaded)))
@@ -87,7 +78,7 @@ def test_all_that_a_solution_may_keep(solution):
 
 
 @pytest.mark.slow
-def test_sensitivities_of_a_solve(palpation, loaded):
+def test_sensitivities_of_a_solve(loaded):
     def peak(c10, friction):
         accurate = op.Newton(rtol=1e-11)
         return op.solve(palpation(c10, friction), op.Imprint(loaded), accurate, throw=False).pressure.max()
@@ -106,7 +97,7 @@ def test_sensitivities_of_a_solve(palpation, loaded):
 
 
 @pytest.mark.slow
-def test_a_sweep_of_fits(palpation, loaded):
+def test_a_sweep_of_fits(loaded):
     def fitted(std):
         return op.fit_traction(palpation(2e-3, 0.2), loaded, op.Matern(length=0.5, std=std), draws=2, throw=False)
 
