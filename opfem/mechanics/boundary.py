@@ -53,12 +53,21 @@ class Touching(NamedTuple):
 
 def take(u: Nodal, body: str, with_sides: bool) -> Corners:
     """Take the nodal values at the corners of all faces that may touch a body, those of the sides last."""
-    corners = gather_face(u[:, _level(u.shape[1], body)]).reshape(4, 3, -1)
-    if not with_sides:
+    nodes = touched(u, body, with_sides)
+    corners = gather_face(nodes.face).reshape(4, 3, -1)
+    if nodes.sides is None:
         return corners
-    strip = [u[:, :, 0, :-1], u[:, :, :-1, -1], u[:, :, -1, :0:-1], u[:, :, :0:-1, 0], u[:, :, 0, :1]]
-    strip = jnp.concatenate(strip, axis=-1)[:, _layers(u.shape[1] - 1, body, nodes=True)]
-    return jnp.concatenate([corners, gather_face(strip).reshape(4, 3, -1)], axis=-1)
+    return jnp.concatenate([corners, gather_face(nodes.sides).reshape(4, 3, -1)], axis=-1)
+
+
+def touched(u: Nodal, body: str, with_sides: bool) -> Touching:
+    """Take the nodal values of all that may touch a body."""
+    face = u[:, _level(u.shape[1], body)]
+    if not with_sides:
+        return Touching(face, None)
+    rows = u[:, _layers(u.shape[1] - 1, body, nodes=True)]
+    strip = [rows[:, :, 0, :-1], rows[:, :, :-1, -1], rows[:, :, -1, :0:-1], rows[:, :, :0:-1, 0], rows[:, :, 0, :1]]
+    return Touching(face, jnp.concatenate(strip, axis=-1))
 
 
 def to_touching(corners: Corners, elements: tuple[int, int, int]) -> Touching:

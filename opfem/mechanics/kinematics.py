@@ -209,16 +209,18 @@ class LayerCells(AbstractCells):
         return tangent.referred(self._to_reference)
 
     def matrices(self, tangent: ProductSum) -> Float[Array, "a b 3 3 nz ny nx"]:
-        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell: six blocks of nine."""
+        """Sum dN_a/dX_J tangent[i, J, k, L] dN_b/dX_L over the points of each cell: six blocks of nine, in a loop."""
 
-        def block(i, k):
-            A = tangent.block(i, k)
+        def block(pair):
+            A = tangent.block(pair[0], pair[1])
             return contract(self.kind.pairs, A.reshape(-1, *A.shape[3:]))
 
-        upper = {(i, k): block(i, k) for i in range(3) for k in range(i, 3)}
-        lower = {(k, i): jnp.swapaxes(K, 0, 1) for (i, k), K in upper.items()}
-        blocks = lower | upper
-        return jnp.stack([jnp.stack([blocks[i, k] for k in range(3)], axis=2) for i in range(3)], axis=2)
+        rows, columns = np.triu_indices(3)
+        upper = jax.lax.map(block, np.stack([rows, columns], axis=1))
+        place = {(i, k): at for at, (i, k) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
+        lower = jnp.swapaxes(upper, 1, 2)
+        blocks = [[upper[place[i, k]] if i <= k else lower[place[k, i]] for k in range(3)] for i in range(3)]
+        return jnp.stack([jnp.stack(row, axis=2) for row in blocks], axis=2)
 
     def in_parts(self, prepare: Callable, finish: Callable, u: Float[Array, "3 mz my mx"], *fields: Any) -> Any:
         """Evaluate finish(cells, prepare(cells, displacement gradient, fields)) one layer of cells at a time.

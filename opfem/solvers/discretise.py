@@ -25,7 +25,7 @@ from ..model import (
     Traction,
     height_field,
 )
-from .equilibrium import Problem, Supports
+from .equilibrium import Problem, Supports, drift_modes
 from .tangent import VOLUME_GUARD
 
 
@@ -101,8 +101,18 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     # Multigrid is made for the stencil of hexahedra; theirs stands in for quadratic elements.
     low_order = layer_body(mesh, material, "full") if palpation.element == "tet10" else None
     contacts = Bodies(with_sides(window), with_sides(sample))
+    supports = _supports(palpation, load)
     return Problem(
-        body, low_order, X, contacts, dead, imposed, spring, jnp.zeros((), X.dtype), _supports(palpation, load)
+        body=body,
+        low_order=low_order,
+        positions=X,
+        contacts=contacts,
+        dead=dead,
+        imposed=imposed,
+        spring=spring,
+        viscosity=jnp.zeros((), X.dtype),
+        drift_modes=drift_modes(X, supports),
+        supports=supports,
     )
 
 

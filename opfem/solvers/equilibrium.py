@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, put, take, to_touching
+from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, put, take, to_touching, touched
 from ..mechanics.face import tributary_area
 from ..mechanics.internal import LayerBody
 from ..model.palpation import SIDES
@@ -101,6 +101,7 @@ class Problem(eqx.Module):
     imposed: tuple[Array, Array] | None  # u_z at the interface [mm], at fraction 0 and 1
     spring: Array | None  # in-plane stiffness under each node of the window face [N/mm]
     viscosity: Array  # of the medium that slows the layer on its way through a snap [-], else 0
+    drift_modes: Float[Array, "modes 2 my mx"] | None  # see `drift_modes`; None where supports prevent them all
     supports: Supports = eqx.field(static=True)
 
     @property
@@ -246,37 +247,19 @@ class Problem(eqx.Module):
         floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(contact + floor**2)
 
-    def drift_modes(self) -> Float[Array, "modes 2 my mx"] | None:
-        """Build orthonormal rigid motions of the window face that no support prevents; None without any.
-
-        Weighted by area: what they measure is the mean in-plane motion of the face.
-        """
-        X = self.positions[:2, 0]
-        area = tributary_area(self.positions[:, 0])
-        centred = X - jnp.sum(area * X, axis=(1, 2), keepdims=True) / jnp.sum(area)
-        zero = jnp.zeros_like(area)
-        candidates = (jnp.stack([area, zero]), jnp.stack([zero, area]), area * jnp.stack([-centred[1], centred[0]]))
-        modes: list[Array] = []
-        for drifts, mode in zip(self.supports.drifts, candidates, strict=True):
-            if drifts:
-                for other in modes:
-                    mode = mode - jnp.sum(mode * other) * other
-                modes.append(mode / jnp.sqrt(jnp.sum(mode**2)))
-        return jnp.stack(modes) if modes else None
-
     def _rigid_part(self, face: Float[Array, "2 my mx"]) -> Float[Array, "2 my mx"]:
         """Compute the part of in-plane nodal values at the window that moves the layer as a whole."""
-        modes = self.drift_modes()
-        if modes is None:
+        if self.drift_modes is None:
             return jnp.zeros_like(face)
-        modes = modes.astype(face.dtype)
+        modes = self.drift_modes.astype(face.dtype)
         return jnp.tensordot(jnp.tensordot(modes, face, 3), modes, 1)
 
     def project(self, r: Nodal, held: Array) -> Nodal:
         """Take the held rigid motions out of a nodal field."""
+        if self.drift_modes is None:
+            return r
         face = r[:2, 0] - jnp.where(held, self._rigid_part(r[:2, 0]), 0.0)
-        bottom = jnp.concatenate([face, r[2:, 0]])
-        return jnp.concatenate([bottom[:, None], r[:, 1:]], axis=1)
+        return jax.lax.dynamic_update_slice(r, face[:, None], (0, 0, 0, 0))
 
     def hold_force(self, forces: Forces, held: Array) -> Float[Array, "2 my mx"]:
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
@@ -366,9 +349,12 @@ class Problem(eqx.Module):
         u = x.u
         applied = self.reactions(forces).applied
 
+        moved = u - state.u
+
         def work(body, before, after, so_far):
-            mean = 0.5 * (put(before, body, u.shape) + put(after, body, u.shape))
-            return so_far + jnp.vdot(mean, u - state.u)
+            own = touched(moved, body, with_sides=after.sides is not None)
+            parts = jax.tree.map(lambda b, a, d: 0.5 * jnp.vdot(b + a, d), before, after, own)
+            return sum(jax.tree.leaves(parts), start=so_far)
 
         histories = self.contacts.map(
             lambda _, face, *args: face.advance(*args), self.locate(u, fraction), state.histories
@@ -401,6 +387,25 @@ class Problem(eqx.Module):
         nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._take(u, body), self.elements))
         applied = Bodies(*(touching or Touching(u[:, 0], None) for touching in nothing))
         return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
+
+
+def drift_modes(positions: Nodal, supports: Supports) -> Float[Array, "modes 2 my mx"] | None:
+    """Build orthonormal rigid motions of the window face that no support prevents; None without any.
+
+    Weighted by area: what they measure is the mean in-plane motion of the face.
+    """
+    X = positions[:2, 0]
+    area = tributary_area(positions[:, 0])
+    centred = X - jnp.sum(area * X, axis=(1, 2), keepdims=True) / jnp.sum(area)
+    zero = jnp.zeros_like(area)
+    candidates = (jnp.stack([area, zero]), jnp.stack([zero, area]), area * jnp.stack([-centred[1], centred[0]]))
+    modes: list[Array] = []
+    for drifts, mode in zip(supports.drifts, candidates, strict=True):
+        if drifts:
+            for other in modes:
+                mode = mode - jnp.sum(mode * other) * other
+            modes.append(mode / jnp.sqrt(jnp.sum(mode**2)))
+    return jnp.stack(modes) if modes else None
 
 
 # Every corner's share of its element, as an element matrix.

@@ -245,7 +245,7 @@ def _widest(tree: Any) -> Any:
 
 def orthonormal_modes(problem: Problem, mass: Float[Array, "my mx"]) -> Float[Array, "modes 2 my mx"] | None:
     """Build the rigid motions that only friction resists, orthonormal when weighted by 1/mass."""
-    modes = problem.drift_modes()
+    modes = problem.drift_modes
     if modes is None:
         return None
     ready: list[Array] = []

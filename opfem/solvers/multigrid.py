@@ -135,23 +135,21 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
         return fine if level.free is None else fine * level.free
 
     half, factors = _SMOOTHING_STEPS, _chebyshev(_SMOOTHING_STEPS)
-    of_step, of_residual = (jnp.asarray(np.concatenate([f[1:], [0.0], f]), r.dtype) for f in factors)
+    of_step, of_residual = (jnp.asarray(np.concatenate([f, [0.0], f]), r.dtype) for f in factors)
 
+    # Steps of the smoother, the coarse correction and again steps of the smoother, in one loop, so that its parts are
+    # compiled once. The last residual is not needed: a product that costs less than a second copy of the smoother.
     def move(k, carry):
         x, r, step = carry
-        x, r = x + step, r - apply_stencil(level.stencil, step)
-        next_step = jax.lax.cond(
-            k == half - 1,
+        step = jax.lax.cond(
+            k == half,
             lambda: correction(r),
             lambda: of_step[k] * step + of_residual[k] * _solve_columns(level.columns, r),
         )
-        return x, r, next_step
+        return x + step, r - apply_stencil(level.stencil, step), step
 
-    # Steps of the smoother, the coarse correction and again steps of the smoother, of which the last is only added.
-    # One loop, so that its parts are compiled once.
-    start = (jnp.zeros_like(r), r, of_residual[half] * _solve_columns(level.columns, r))
-    x, _, step = jax.lax.fori_loop(0, 2 * half, move, start)
-    return x + step
+    none = jnp.zeros_like(r)
+    return jax.lax.fori_loop(0, 2 * half + 1, move, (none, r, none))[0]
 
 
 def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
