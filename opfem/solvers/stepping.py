@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..mechanics.staging import apart
 from .equilibrium import Forces, Problem, State
 from .newton import Newton, solve_increment
 from .solution import RESULTS
@@ -145,7 +146,6 @@ def unfinished(s: Stepping) -> Array:
 
 def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     """Try one load increment, or one solve of a snap; keep it if it converges, else return to the last state."""
-    full = 1.0 / settings.increments
     left = 1.0 - s.state.fraction
     increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
     fraction = s.state.fraction + increment
@@ -164,55 +164,92 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     result = solve_increment(
         slowed, s.origin, guess, fraction, held, eqx.tree_at(lambda n: [n.rtol, n.max_steps], settings, limits)
     )
-    ok = result.converged
-    accepted = ok & (s.viscosity == 0)
-
-    viscosity, speed = _next_viscosity(s, result.state, ok, result.steps, snapping)
-    begins = ~ok & ~snapping & (increment <= _SNAP_SHARES[0] * full) & (increment > _SNAP_SHARES[1] * full)
-    viscosity = jnp.where(begins, _FIRST_VISCOSITY, viscosity)
-    going = (viscosity <= _MOST_VISCOSITY) & (s.snap_solves < _SNAP_SOLVES)
-    goes_on = begins | (snapping & ~accepted & going)
-    viscosity = jnp.where(goes_on, viscosity, 0.0)
-    lost = ~accepted & ~goes_on
-    # Without the hold and without convergence: cut the increment a few times, then take the hold back.
-    lost_hold = lost & ~held & (increment < _LEAST_RELEASED * full)
-    cut = jnp.where(lost & ~lost_hold, 0.5 * increment, increment)
-    grown = jnp.minimum(1.5 * s.increment, full)
-    grown = jnp.where(result.steps <= settings.max_steps // 2, grown, s.increment)
-
-    state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
-    origin = _where(goes_on, _where(ok, result.state, s.origin), state)
-    moves_on = accepted | (goes_on & ok)
-    length = jnp.where(moves_on, s.length + 1, jnp.where(goes_on, s.length, s.kept))
     can_release, slides = _hold_balance(problem, result.forces, result.state)
     missed_gap = problem.missed_gap(s.origin, result.state)
-    settles = (left > 0) | (missed_gap < _LEAST_SETTLING * s.missed_gap)
-    missed_gap = jnp.where(settles & (missed_gap > _NO_GAP * problem.body.cells.element_depth), missed_gap, 0.0)
-    attempts = s.attempts + 1
+    none = s._replace(state=None, before=None, origin=None, fractions=None, path=None)
+    trial = _Trial(
+        increment=increment,
+        held=held,
+        snapping=snapping,
+        converged=result.converged,
+        steps=result.steps,
+        furthest=jnp.max(jnp.abs(result.state.u - s.origin.u)),
+        missed_gap=missed_gap,
+        no_gap=_NO_GAP * problem.body.cells.element_depth,
+    )
+    next_s, (accepted, goes_on, moves_on) = apart(_decided, none, trial, settings)
+    state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
+    origin = _where(goes_on, _where(trial.converged, result.state, s.origin), state)
     solved = Path(result.state.unknowns, fraction, held, s.viscosity)
-    return Stepping(
+    return next_s._replace(
         state=state,
         before=before,
         origin=origin,
-        viscosity=viscosity,
+        newton=s.newton + result.steps,
+        krylov=s.krylov + result.krylov,
+        residual=jnp.where(accepted, result.residual, s.residual),
+        can_release=jnp.where(accepted, can_release, s.can_release),
+        slides=jnp.where(accepted, slides, s.slides),
+        fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
+        path=None if s.path is None else _recorded(s, moves_on, solved),
+    )
+
+
+class _Trial(NamedTuple):
+    """What is known of one equilibrium sought: see `Stepping`, `attempt` and `IncrementResult`."""
+
+    increment: Array
+    held: Array
+    snapping: Array
+    converged: Array
+    steps: Array
+    furthest: Array
+    missed_gap: Array
+    no_gap: Array
+
+
+def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tuple[Array, Array, Array]]:
+    """Decide what follows from one equilibrium sought, by numbers alone (`apart`, so that they are computed once).
+
+    Returns:
+        `Stepping` but for states and what they are measured by; whether the state is accepted, whether a snap goes on,
+        and whether the path moves on.
+    """
+    full = 1.0 / settings.increments
+    ok, steps, increment = trial.converged, trial.steps, trial.increment
+    accepted = ok & (s.viscosity == 0)
+
+    viscosity, speed = _next_viscosity(s, trial)
+    begins = ~ok & ~trial.snapping & (increment <= _SNAP_SHARES[0] * full) & (increment > _SNAP_SHARES[1] * full)
+    viscosity = jnp.where(begins, _FIRST_VISCOSITY, viscosity)
+    going = (viscosity <= _MOST_VISCOSITY) & (s.snap_solves < _SNAP_SOLVES)
+    goes_on = begins | (trial.snapping & ~accepted & going)
+    lost = ~accepted & ~goes_on
+    # Without the hold and without convergence: cut the increment a few times, then take the hold back.
+    lost_hold = lost & ~trial.held & (increment < _LEAST_RELEASED * full)
+    cut = jnp.where(lost & ~lost_hold, 0.5 * increment, increment)
+    grown = jnp.minimum(1.5 * s.increment, full)
+    grown = jnp.where(steps <= settings.max_steps // 2, grown, s.increment)
+
+    moves_on = accepted | (goes_on & ok)
+    length = jnp.where(moves_on, s.length + 1, jnp.where(goes_on, s.length, s.kept))
+    settles = (increment > 0) | (trial.missed_gap < _LEAST_SETTLING * s.missed_gap)
+    missed_gap = jnp.where(settles & (trial.missed_gap > trial.no_gap), trial.missed_gap, 0.0)
+    attempts = s.attempts + 1
+    stepping = s._replace(
+        viscosity=jnp.where(goes_on, viscosity, 0.0),
         speed=speed,
         increment=jnp.where(accepted, grown, cut),
         snap_solves=jnp.where(goes_on, s.snap_solves + 1, 0),
         attempts=attempts,
         increments=s.increments + accepted,
-        newton=s.newton + result.steps,
-        krylov=s.krylov + result.krylov,
-        residual=jnp.where(accepted, result.residual, s.residual),
-        can_release=jnp.where(accepted, can_release, s.can_release),
         release_failed=s.release_failed | lost_hold,
-        slides=jnp.where(accepted, slides, s.slides),
         missed_gap=jnp.where(accepted, missed_gap, s.missed_gap),
         failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
-        fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
-        path=None if s.path is None else _recorded(s, moves_on, solved),
         length=length,
         kept=jnp.where(accepted, length, s.kept),
     )
+    return stepping, (accepted, goes_on, moves_on)
 
 
 def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:
@@ -225,9 +262,10 @@ def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:
     return jax.tree.map(write, s.path, solve)
 
 
-def _next_viscosity(s: Stepping, state: State, ok: Array, steps: Array, snapping: Array) -> tuple[Array, Array]:
+def _next_viscosity(s: Stepping, trial: _Trial) -> tuple[Array, Array]:
     """Thicken the medium after a failed solve of a snap; thin it where the motion dies out."""
-    speed = s.viscosity * jnp.max(jnp.abs(state.u - s.origin.u))
+    ok, steps = trial.converged, trial.steps
+    speed = s.viscosity * trial.furthest
     dies_out = (speed < s.speed) & (steps <= _VISCOUS_STEPS // 2)
     easily = steps <= _VISCOUS_STEPS // 4
     factor = jnp.where(easily, _VISCOSITY_FACTOR**2, _VISCOSITY_FACTOR)
@@ -235,7 +273,7 @@ def _next_viscosity(s: Stepping, state: State, ok: Array, steps: Array, snapping
     thinner = jnp.where(thinner < _NO_VISCOSITY, 0.0, thinner)
     thicker = _VISCOSITY_FACTOR * jnp.maximum(s.viscosity, _NO_VISCOSITY)
     viscosity = jnp.where(ok, thinner, thicker)
-    return jnp.where(snapping, viscosity, 0.0), jnp.where(ok & snapping, speed, 0.0)
+    return jnp.where(trial.snapping, viscosity, 0.0), jnp.where(ok & trial.snapping, speed, 0.0)
 
 
 def _where(condition: Array, new, old):
