@@ -5,7 +5,8 @@ Friction is Coulomb's with elastic slip and a return map; the slip of a point is
 the surface, in the surface's own (x, y), and its history is carried from increment to increment.
 """
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from ..model import Contact, HeightField
 from ..model.surface import Patches
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
+from .paired_contact import PairedContact, PairedSurface, join, split
 from .staging import apart
 
 # Share of the largest elastic slip from which a point counts as slipping.
@@ -34,14 +36,14 @@ class SlipHistory(eqx.Module):
         position: (x, y) of the points `(2, points, *faces)` [mm].
         elastic: Elastic part of the slip `(2, points, *faces)` [mm].
         slip: Slip slid so far, along x and y `(2, points, *faces)` [mm].
-        dissipated: Work done by friction so far on the whole face [N mm].
+        dissipated: Work done by friction so far on the whole face [N mm]; of each body where faces are paired.
         pressure: Contact pressure at the points [MPa], where the next increment starts from.
     """
 
     position: Float[Array, "2 points *faces"]
     elastic: Float[Array, "2 points *faces"]
     slip: Float[Array, "2 points *faces"]
-    dissipated: Float[Array, ""]
+    dissipated: Float[Array, "*bodies"] | None
     pressure: Float[Array, "points *faces"]
 
 
@@ -62,6 +64,23 @@ class ContactIterate(NamedTuple):
     def after(self, length: Array) -> "ContactIterate":
         """Take a step of a length from 0 to 1."""
         return self._replace(pressure=jnp.maximum(self.pressure + length * self.change, 0.0))
+
+
+def joined_histories(histories: Sequence[SlipHistory]) -> SlipHistory:
+    """Put the histories of several faces side by side."""
+    if len(histories) == 1:
+        return histories[0]
+    dissipated = jnp.stack([history.dissipated for history in histories])
+    joined = join([dataclasses.replace(history, dissipated=None) for history in histories])
+    return dataclasses.replace(joined, dissipated=dissipated)
+
+
+def separate_histories(history: SlipHistory, count: int) -> list[SlipHistory]:
+    """Undo `joined_histories`."""
+    if count == 1:
+        return [history]
+    parts = split(dataclasses.replace(history, dissipated=None), count)
+    return [dataclasses.replace(part, dissipated=history.dissipated[k]) for k, part in enumerate(parts)]
 
 
 class TangentLaw(NamedTuple):
@@ -143,6 +162,11 @@ class RigidSurface(eqx.Module):
     start: HeightField | None
     end: HeightField | None
 
+    @property
+    def is_plane(self) -> bool:
+        """Whether it is the plane z = 0."""
+        return self.end is None
+
     def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Evaluate height [mm] and slopes [-] when a fraction of the motion is done."""
         d = self.derivatives(fraction, x, y, 1)
@@ -212,23 +236,23 @@ class ContactFace(eqx.Module):
     Attributes:
         contact: Law and friction.
         surface: The rigid surface.
-        offset: Shift of the surface away from the layer [mm].
+        offset: Shift of the surface away from the layer [mm]; of each of them where they are paired.
         imposed: For a `Traction` load, whose dead pressure only bounds friction, and whose springs push.
         element_size: Size of an element [mm]; default elastic slip is a fraction of it.
         stiffness: Stiffness of an element per area [MPa/mm], the scale of hard contact.
-        above: True for the sample, False for the window.
+        above: True for the sample, False for the window; of each of them where they are paired.
         rule: Where contact is integrated.
         sides: Which faces are sides, pushed only where they have turned towards the surface; None: none.
         shares: What each point stands for where the points of a face are not alike (`node_shares`).
     """
 
-    contact: Contact
-    surface: RigidSurface
+    contact: Contact | PairedContact
+    surface: RigidSurface | PairedSurface
     offset: Array
     imposed: "ImposedPressure | None"
     element_size: Array
     stiffness: Array
-    above: bool = eqx.field(static=True)
+    above: bool | tuple[bool, ...] = eqx.field(static=True)
     rule: FaceRule = eqx.field(static=True)
     sides: Bool[Array, " *faces"] | None = None
     shares: Float[Array, "points *faces"] | None = None
@@ -249,7 +273,7 @@ class ContactFace(eqx.Module):
 
         d = (
             under(self.surface, fraction, position)
-            if self.surface.end is None
+            if self.surface.is_plane
             else apart(under, self.surface, fraction, position)
         )
         bend = jnp.stack([jnp.stack([d[0, 2], d[1, 1]]), jnp.stack([d[1, 1], d[2, 0]])]) if bends else None
@@ -261,7 +285,7 @@ class ContactFace(eqx.Module):
         pressure, push, _, _ = self._pressure(points, clearance, law or self._law(history))
         friction = self._friction(pressure, points, history, None if law is None else law.sticks)
         return PointContact(
-            friction.traction - self._side * push * points.normal,
+            friction.traction - self._side(push) * push * points.normal,
             pressure,
             clearance,
             friction.elastic,
@@ -271,12 +295,17 @@ class ContactFace(eqx.Module):
             friction.slips,
         )
 
-    @property
-    def _side(self) -> float:
-        return 1.0 if self.above else -1.0
+    def _side(self, points: Array) -> np.ndarray:
+        """Say on which side of the layer the surface is: 1 above, -1 below; broadcasts to points."""
+        side = np.where(self.above, 1.0, -1.0)
+        return np.repeat(side, points.shape[-1] // side.size) if side.ndim else side
 
     def _clearance(self, points: FacePoints) -> Float[Array, "points *faces"]:
-        return (self._side * (points.height - points.position[2]) + self.offset) / points.stretch
+        towards = self._side(points.height) * (points.height - points.position[2])
+        offset = (
+            jnp.repeat(self.offset, points.height.shape[-1] // self.offset.size) if self.offset.ndim else self.offset
+        )
+        return (towards + offset) / points.stretch
 
     @property
     def is_exact(self) -> bool:
@@ -351,7 +380,7 @@ class ContactFace(eqx.Module):
 
     def _clearance_slope(self, points: FacePoints, clearance: Array, curvature: Array | float) -> PointVector:
         """Compute the derivative of the clearance by the points' positions [-], with a share of the curvature."""
-        return -self._side * points.normal - clearance / points.stretch * _stretch_slope(points, curvature)
+        return -self._side(clearance) * points.normal - clearance / points.stretch * _stretch_slope(points, curvature)
 
     def _friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "_Friction":
         trial, (slope_x, slope_y) = _trial(points, history), points.slope
@@ -413,16 +442,16 @@ class ContactFace(eqx.Module):
         shrinking = friction.stiffness / length * jnp.sum(friction.reach[:, None] / length * by_reach, axis=0)
         by_stiffness = jnp.where(friction.limited, strength / length * by_pressure - shrinking, softer * by_pressure)
         rubbing = friction.reach[:, None] * by_stiffness + friction.stiffness * by_reach
-        by_position = -jnp.where(pressure > 0, rubbing, 0.0) - self._side * (
-            normal[:, None] * by_push + push * by_normal
-        )
+        side = self._side(push)
+        pressing = side * (normal[:, None] * by_push + push * by_normal)
+        by_position = -jnp.where(pressure > 0, rubbing, 0.0) - pressing
 
         along = normal[:, None] * normal
         direction = jnp.where(friction.limited, friction.reach / length, 0.0)
         eye = np.eye(3).reshape(plane.shape)
         guard = friction.stiffness * (eye - along - direction[:, None] * direction)
         pushing = push_slope if self.imposed is not None else -slope
-        return friction.traction - self._side * push * normal, by_position, pushing * along + guard
+        return friction.traction - side * push * normal, by_position, pushing * along + guard
 
     def _stick(self, pressure: Array) -> Array:
         return self.contact.stick_stiffness(pressure, self.element_size)
@@ -441,7 +470,7 @@ class ContactFace(eqx.Module):
         area = area_vector(tangents[0], tangents[1])
         if self.sides is None:
             return size(area)
-        towards = jnp.maximum(area[2] if self.above else -area[2], 0.0)
+        towards = jnp.maximum(self._side(area[2]) * area[2], 0.0)
         return jnp.where(self.sides, towards, size(area))
 
     def force(self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None) -> Corners:
@@ -476,7 +505,8 @@ class ContactFace(eqx.Module):
         point = self.at_points(points, history)
         weights = quadrature(self.rule).weights
         work = self._area(points.tangents) * jnp.sum(point.friction * point.slid, axis=0)
-        dissipated = history.dissipated - jnp.sum(jnp.tensordot(weights, work, 1))
+        dissipated = jnp.tensordot(weights, work, 1).reshape(*history.dissipated.shape, -1)  # paired: of each body
+        dissipated = history.dissipated - jnp.sum(dissipated, axis=-1)
         return SlipHistory(points.position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
 
 
@@ -490,6 +520,35 @@ def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
     assert points.bend is not None
     along = points.slope[0] * points.bend[0] + points.slope[1] * points.bend[1]
     return jnp.concatenate([curvature * along / points.stretch, jnp.zeros_like(along[:1])])
+
+
+def paired(faces: Sequence[ContactFace]) -> ContactFace:
+    """Make one contact face of several (`can_pair`)."""
+    first, count = faces[0], len(faces)
+    if count == 1:
+        return first
+
+    def side_by_side(values):
+        return None if values[0] is None else jnp.concatenate(values, axis=-1)
+
+    return ContactFace(
+        contact=PairedContact(tuple(face.contact for face in faces)),
+        surface=PairedSurface(tuple(face.surface for face in faces)),
+        offset=jnp.stack([face.offset for face in faces]),
+        imposed=None,
+        element_size=first.element_size,
+        stiffness=first.stiffness,
+        above=tuple(face.above for face in faces),
+        rule=first.rule,
+        sides=side_by_side([face.sides for face in faces]),
+        shares=side_by_side([face.shares for face in faces]),
+    )
+
+
+def can_pair(faces: Sequence[ContactFace]) -> bool:
+    """Tell whether contact faces are integrated alike, so that they can be evaluated as one."""
+    alike = {(face.rule, face.contact.law.exact, face.sides is None) for face in faces}
+    return len(alike) == 1 and all(face.imposed is None for face in faces)
 
 
 class _Friction(NamedTuple):

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..mechanics.boundary import Bodies
 from .equilibrium import Problem, State
 from .newton import Newton, solve_tangent
 from .stepping import Path
@@ -47,7 +46,7 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
         def tangent_solve(matvec, b):
             def solver(transposed):
                 def solved(A, c):
-                    tangent = slowed.tangent(solve.x, solve.fraction, state, Bodies(), transposed)
+                    tangent = slowed.tangent(solve.x, solve.fraction, state, None, transposed)
                     if transposed:
                         A = _transposed_product(slowed, solve.x, solve.fraction, state, solve.held)
                     return _solve(slowed, tangent, transposed, solve.held, A, c, is_known, settings)
@@ -78,7 +77,7 @@ def linearise_path(problem: Problem, start: State, path: Path, length: Array, se
     frozen, first = jax.lax.stop_gradient((problem, start))
 
     def tangent_of(slowed: Problem, state: State, solve: Path, _):
-        return solve.x, slowed.tangent(solve.x, solve.fraction, state, Bodies())
+        return solve.x, slowed.tangent(solve.x, solve.fraction, state)
 
     _, tangents = _scan_path(frozen, first, (path, None), length, tangent_of)
 

@@ -4,6 +4,7 @@ Everything a Newton step needs, with the load fraction as a number from 0 (start
 the friction history of the last converged increment.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,19 @@ from jaxtyping import Array, Float
 
 from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, put, take, to_touching, touched
 from ..mechanics.face import tributary_area
+from ..mechanics.interaction import (
+    ContactFace,
+    ContactIterate,
+    FacePoints,
+    SlipHistory,
+    TangentLaw,
+    can_pair,
+    joined_histories,
+    paired,
+    separate_histories,
+)
 from ..mechanics.internal import LayerBody
+from ..mechanics.paired_contact import split
 from ..model.palpation import SIDES
 from .multigrid import build_multigrid
 from .stencil import Nodal
@@ -90,6 +103,21 @@ class Forces(NamedTuple):
     smallest_J: Array
 
 
+class Touch(NamedTuple):
+    """Contact faces that are evaluated as one, and which bodies they belong to."""
+
+    names: tuple[Body, ...]
+    face: ContactFace
+
+    def history(self, histories: Bodies) -> SlipHistory:
+        """Put the friction histories of the bodies side by side."""
+        return joined_histories([getattr(histories, name) for name in self.names])
+
+    def split(self, values: Any) -> dict[str, Any]:
+        """Split values of all faces into those of each body."""
+        return dict(zip(self.names, split(values, len(self.names)), strict=True))
+
+
 class Problem(eqx.Module):
     """A palpation and its load, discretised."""
 
@@ -128,45 +156,55 @@ class Problem(eqx.Module):
         spring = None if self.spring is None else -self.spring * u[:2, 0]
         return Forces(internal, volume, Bodies(), spring, smallest_J)
 
-    def locate(self, u: Nodal, fraction: Array, bends: bool = False) -> Bodies:
-        """Find the points of all faces that may touch a body (`FacePoints`), with the surfaces' bends if asked."""
-        return self.contacts.map(lambda body, face: face.locate(fraction, self._take(self.positions + u, body), bends))
+    @property
+    def faces(self) -> tuple["Touch", ...]:
+        """The contacts, of window and sample together where they can be evaluated as one."""
+        there = [(name, face) for name, face in zip(Bodies._fields, self.contacts, strict=True) if face is not None]
+        groups = [there] if can_pair([face for _, face in there]) else [[one] for one in there]
+        return tuple(Touch(tuple(name for name, _ in group), paired([face for _, face in group])) for group in groups)
+
+    def locate(self, u: Nodal, fraction: Array, bends: bool = False) -> tuple[FacePoints, ...]:
+        """Find the points of `faces`, with the surfaces' second derivatives if asked."""
+        x = self.positions + u
+        return tuple(touch.face.locate(fraction, self._take(x, touch), bends) for touch in self.faces)
 
     def with_contact(
-        self, forces: Forces, points: Bodies, fraction: Array, state: State, laws: Bodies | None = None
+        self, forces: Forces, points: tuple, fraction: Array, state: State, laws: tuple | None = None
     ) -> Forces:
         """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
-        applied = self.contacts.map(
-            lambda _, face, points, history, law: to_touching(face.force(points, history, law), self.elements),
-            points,
-            state.histories,
-            laws or Bodies(),
-        )
         none = Touching(jnp.zeros_like(forces.internal[:, 0]), None)
-        window, sample = (none if touching is None else touching for touching in applied)
+        applied = Bodies(none, none)
+        for touch, at, law in self._each(points, laws):
+            corners = touch.face.force(at, touch.history(state.histories), law)
+            applied = applied._replace(
+                **{name: to_touching(own, self.elements) for name, own in touch.split(corners).items()}
+            )
         if self.dead is not None:
-            sample = sample._replace(face=sample.face + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1])
-        return forces._replace(applied=Bodies(window, sample))
+            face = applied.sample.face + (1.0 - fraction) * self.dead[0] + fraction * self.dead[1]
+            applied = applied._replace(sample=applied.sample._replace(face=face))
+        return forces._replace(applied=applied)
 
-    def _take(self, values: Nodal, body: Body) -> Corners:
-        return take(values, body, with_sides=getattr(self.contacts, body).sides is not None)
+    def _each(self, *of_faces: tuple | None) -> Iterator[tuple]:
+        """Go through `faces` and what belongs to each."""
+        nothing = (None,) * len(self.faces)
+        return zip(self.faces, *(values or nothing for values in of_faces), strict=True)
 
-    def tangent_laws(self, points: Bodies, state: State, iterates: Bodies, curvature: Array) -> Bodies:
-        """Linearise contact (`TangentLaw`)."""
-        return self.contacts.map(
-            lambda _, face, points, history, it: face.tangent_law(points, history, it, curvature),
-            points,
-            state.histories,
-            iterates,
+    def _take(self, values: Nodal, touch: "Touch") -> Corners:
+        sides = touch.face.sides is not None
+        return jnp.concatenate([take(values, name, with_sides=sides) for name in touch.names], axis=-1)
+
+    def tangent_laws(self, points: tuple, state: State, iterates: tuple, curvature: Array) -> tuple[TangentLaw, ...]:
+        """Linearise contact."""
+        return tuple(
+            touch.face.tangent_law(at, touch.history(state.histories), iterate, curvature)
+            for touch, at, iterate in self._each(points, iterates)
         )
 
-    def follow(self, points: Bodies, change: Nodal, state: State, laws: Bodies) -> Bodies:
-        """Compute what the next iteration remembers (`ContactIterate`) once a part of the step `change` is taken."""
-        return self.contacts.map(
-            lambda body, face, points, history, law: face.follow(points, self._take(change, body), history, law),
-            points,
-            state.histories,
-            laws,
+    def follow(self, points: tuple, change: Nodal, state: State, laws: tuple) -> tuple[ContactIterate, ...]:
+        """Compute what the next iteration remembers once a part of the step `change` is taken."""
+        return tuple(
+            touch.face.follow(at, self._take(change, touch), touch.history(state.histories), law)
+            for touch, at, law in self._each(points, laws)
         )
 
     def missed_gap(self, before: State, after: State) -> Array:
@@ -176,9 +214,9 @@ class Problem(eqx.Module):
         )
         return jnp.max(jnp.stack([jnp.zeros_like(after.fraction), *jax.tree.leaves(gaps)]))
 
-    def initial_iterates(self, state: State) -> Bodies:
+    def initial_iterates(self, state: State) -> tuple[ContactIterate, ...]:
         """Start the iteration from the contact of a converged state."""
-        return self.contacts.map(lambda _, face, history: face.initial_iterate(history), state.histories)
+        return tuple(touch.face.initial_iterate(touch.history(state.histories)) for touch in self.faces)
 
     def reactions(self, forces: Forces) -> Forces:
         """Add the reactions of prescribed displacements to the forces of window and sample."""
@@ -272,9 +310,9 @@ class Problem(eqx.Module):
         x: Unknowns,
         fraction: Array,
         state: State,
-        laws: Bodies,
+        laws: tuple[TangentLaw, ...] | None = None,
         transposed: bool = False,
-        points: Bodies | None = None,
+        points: tuple[FacePoints, ...] | None = None,
     ) -> Tangent:
         """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
 
@@ -282,7 +320,7 @@ class Problem(eqx.Module):
             x: Displacement [mm], and mean stress [MPa] where it is an unknown.
             fraction: Load fraction [-].
             state: Where the increment started.
-            laws: Linearised contact laws; empty for the contact's own.
+            laws: Linearised contact laws; None for the contact's own.
             transposed: Whether to return the transposed tangent.
             points: `locate(x.u, fraction, bends=True)`, where that is known.
         """
@@ -290,23 +328,17 @@ class Problem(eqx.Module):
         body, low_order = _single(self.body), _single(self.low_order or self.body)
         drag = _single(self._drag(self.viscosity))
         K = low_order.cell_stiffness(_single(u), _single(mean_stress), more=drag * _LUMPED)
-        points = None if self.low_order is None else body.point_tangent(_single(u))
+        pointwise = None if self.low_order is None else body.point_tangent(_single(u))
         volume = None
         if mean_stress is not None:
             volume, stiffness = couple_volume(body, self.free, _single(u), _single(self.stress_scale))
             K = K + stiffness
-        matrices = self.contacts.map(
-            lambda _, face, *args: face.stiffness_matrices(*args),
-            points or self.locate(u, fraction, bends=True),
-            state.histories,
-            laws,
-        )
         faces = {}
-        for name, both in zip(Bodies._fields, matrices, strict=True):
-            if both is not None:
-                exact, guard = _single(both)
+        for touch, at, law in self._each(points or self.locate(u, fraction, bends=True), laws):
+            both = _single(touch.face.stiffness_matrices(at, touch.history(state.histories), law))
+            for name, (exact, guard) in touch.split(both).items():
                 K = add_matrices(K, guard, name)
-                faces[name] = exact if points is not None else exact - guard
+                faces[name] = exact if pointwise is not None else exact - guard
         scale = self.typical_stiffness
         spring = jnp.zeros(()) if self.spring is None else jnp.sum(self.spring)
         support = jnp.zeros(())
@@ -316,7 +348,7 @@ class Problem(eqx.Module):
             K = add_matrices(K, _single(self._foundation(spring + support)), "window")
         shape = u.shape[1:]
         diagonal = -support * _window_share(shape)
-        if points is not None:
+        if pointwise is not None:
             diagonal = spring * _window_share(shape) + drag * _node_share(shape)
         free = self.free
         tangent = Tangent(
@@ -325,7 +357,7 @@ class Problem(eqx.Module):
             diagonal=_single(diagonal),
             free=None if free.all() else jnp.asarray(free, jnp.float32),
             cells=body.cells,
-            points=points,
+            points=pointwise,
             volume=volume,
         )
         return tangent.transposed() if transposed else tangent
@@ -356,18 +388,22 @@ class Problem(eqx.Module):
             parts = jax.tree.map(lambda b, a, d: 0.5 * jnp.vdot(b + a, d), before, after, own)
             return sum(jax.tree.leaves(parts), start=so_far)
 
-        histories = self.contacts.map(
-            lambda _, face, *args: face.advance(*args), self.locate(u, fraction), state.histories
-        )
+        histories = {}
+        for touch, at in self._each(self.locate(u, fraction)):
+            history = touch.face.advance(at, touch.history(state.histories))
+            histories |= dict(zip(touch.names, separate_histories(history, len(touch.names)), strict=True))
         return State(
             u=u,
             mean_stress=x.mean_stress,
             fraction=jnp.asarray(fraction, u.dtype),
-            histories=histories,
+            histories=Bodies(**histories),
             held=held,
             applied=applied,
             work=state.applied.map(work, applied, state.work),
         )
+
+    def _corners(self, values: Nodal, body: Body) -> Corners:
+        return take(values, body, with_sides=getattr(self.contacts, body).sides is not None)
 
     def with_imposed(self, u: Nodal, fraction: Array) -> Nodal:
         """Set the prescribed displacements."""
@@ -380,11 +416,11 @@ class Problem(eqx.Module):
 
     def initial_state(self) -> State:
         """Build the undeformed state at load fraction zero."""
-        histories = self.contacts.map(lambda body, face: face.initial_history(self._take(self.positions, body)))
+        histories = self.contacts.map(lambda body, face: face.initial_history(self._corners(self.positions, body)))
         u = jnp.zeros_like(self.positions)
         mean_stress = jnp.zeros(self.elements, u.dtype) if self.body.form == "hybrid" else None
         zero = jnp.zeros((), u.dtype)
-        nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._take(u, body), self.elements))
+        nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._corners(u, body), self.elements))
         applied = Bodies(*(touching or Touching(u[:, 0], None) for touching in nothing))
         return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
 

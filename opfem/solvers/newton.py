@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import check_positive
-from ..mechanics.boundary import Bodies
 from ..mechanics.face import FaceRule
+from ..mechanics.interaction import ContactIterate
 from .equilibrium import Forces, Problem, State
 from .krylov import KrylovResult, fgmres
 from .stencil import Nodal
@@ -107,7 +107,7 @@ class _Iterate(NamedTuple):
 
     x: Unknowns
     direction: Unknowns
-    contact: Bodies  # of ContactIterate
+    contact: tuple[ContactIterate, ...]
     forces: Forces  # at x, as size and tolerance
     size: Array
     tolerance: Array
@@ -154,7 +154,7 @@ def solve_increment(
         hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
-            contact=it.contact.map(lambda _, contact: contact.after(length)),
+            contact=tuple(contact.after(length) for contact in it.contact),
             forces=forces,
             size=size,
             tolerance=tolerance,
