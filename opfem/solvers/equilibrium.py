@@ -373,8 +373,18 @@ class Problem(eqx.Module):
         each = stiffness / (4.0 * nx * ny) * lumped[..., None]
         return jnp.broadcast_to(each, (4, 4, 3, 3, ny * nx))
 
-    def advance(self, x: Unknowns, fraction: Array, state: State, held: Array, forces: Forces) -> State:
+    def advance(
+        self,
+        x: Unknowns,
+        fraction: Array,
+        state: State,
+        held: Array,
+        forces: Forces,
+        points: tuple[FacePoints, ...] | None = None,
+    ) -> State:
         """Build the state at the end of an increment, friction history included.
+
+        `points` is `locate(x.u, fraction)`, where that is known.
 
         The work of an increment is taken as if forces changed linearly along it.
         """
@@ -389,7 +399,7 @@ class Problem(eqx.Module):
             return sum(jax.tree.leaves(parts), start=so_far)
 
         histories = {}
-        for touch, at in self._each(self.locate(u, fraction)):
+        for touch, at in self._each(points or self.locate(u, fraction)):
             history = touch.face.advance(at, touch.history(state.histories))
             histories |= dict(zip(touch.names, separate_histories(history, len(touch.names)), strict=True))
         return State(

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._checks import check_positive
 from ..mechanics.face import FaceRule
-from ..mechanics.interaction import ContactIterate
+from ..mechanics.interaction import ContactIterate, FacePoints
 from .equilibrium import Forces, Problem, State
 from .krylov import KrylovResult, fgmres
 from .stencil import Nodal
@@ -108,7 +108,8 @@ class _Iterate(NamedTuple):
     x: Unknowns
     direction: Unknowns
     contact: tuple[ContactIterate, ...]
-    forces: Forces  # at x, as size and tolerance
+    forces: Forces  # at x, as points, size and tolerance
+    points: tuple[FacePoints, ...]
     size: Array
     tolerance: Array
     steps: Array
@@ -128,10 +129,11 @@ def solve_increment(
     """
 
     def evaluate(x):
-        forces = problem.forces(x, fraction, state)
+        points = problem.locate(x.u, fraction, bends=True)
+        forces = problem.with_contact(problem.own_forces(x, state), points, fraction, state)
         size = problem.size(problem.residual(forces, held))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
-        return forces, size, settings.rtol * problem.force_scale(forces)
+        return (forces, points), size, settings.rtol * problem.force_scale(forces)
 
     def is_settled(size, tolerance):
         return size < _SETTLED / settings.rtol * tolerance
@@ -148,14 +150,15 @@ def solve_increment(
         def unusable(carry):
             return ~jnp.isfinite(carry[3]) & (carry[1] <= settings.max_backtracks)
 
-        start = (jnp.ones_like(it.size), 0, it.forces, jnp.full_like(it.size, jnp.inf), it.tolerance)
-        length, _, forces, size, tolerance = jax.lax.while_loop(unusable, shorten, start)
+        start = (jnp.ones_like(it.size), 0, (it.forces, it.points), jnp.full_like(it.size, jnp.inf), it.tolerance)
+        length, _, (forces, points), size, tolerance = jax.lax.while_loop(unusable, shorten, start)
         unsettled = jnp.where(is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
         hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
             contact=tuple(contact.after(length) for contact in it.contact),
             forces=forces,
+            points=points,
             size=size,
             tolerance=tolerance,
             unsettled=unsettled,
@@ -163,17 +166,15 @@ def solve_increment(
         )
 
     def find_step(it):
-        u = it.x.u
         curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
-        points = problem.locate(u, fraction, bends=True)
-        laws = problem.tangent_laws(points, state, it.contact, curvature)
-        r = problem.residual(problem.with_contact(it.forces, points, fraction, state, laws), held)
-        tangent = problem.tangent(it.x, fraction, state, laws, points=points)
+        laws = problem.tangent_laws(it.points, state, it.contact, curvature)
+        r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), held)
+        tangent = problem.tangent(it.x, fraction, state, laws, points=it.points)
         solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
         change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
         return it._replace(
             direction=solution.x._replace(u=change),
-            contact=problem.follow(points, change, state, laws),
+            contact=problem.follow(it.points, change, state, laws),
             steps=it.steps + 1,
             krylov=it.krylov + solution.iterations,
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),
@@ -185,11 +186,13 @@ def solve_increment(
 
     x = guess._replace(u=problem.with_imposed(guess.u, fraction))
     zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, x.u.dtype)
+    forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(evaluate, x)[0])
     first = _Iterate(
         x=x,
         direction=jax.tree.map(jnp.zeros_like, x),
         contact=problem.initial_iterates(state),
-        forces=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(evaluate, x)[0]),
+        forces=forces,
+        points=points,
         size=far,
         tolerance=far,
         steps=zero,
@@ -200,7 +203,7 @@ def solve_increment(
     )
     end = jax.lax.while_loop(lambda it: ~it.finished, step, first)
     return IncrementResult(
-        state=problem.advance(end.x, fraction, state, held, end.forces),
+        state=problem.advance(end.x, fraction, state, held, end.forces, end.points),
         converged=end.size <= end.tolerance,
         steps=end.steps,
         krylov=end.krylov,

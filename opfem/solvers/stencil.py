@@ -146,10 +146,10 @@ def _hat(offset: int) -> float:
 
 def neighbours(values: Float[Array, "c mz my mx"]) -> Float[Array, "3 9 c mz my mx"]:
     """Collect what the 27 neighbours of every node have; zero beyond the border."""
-    mz, my, mx = values.shape[1:]
-    padded = jnp.pad(values, [(0, 0), (1, 1), (1, 1), (1, 1)])
-    offsets = itertools.product(range(3), repeat=3)
-    around = jnp.stack([padded[:, z : z + mz, y : y + my, x : x + mx] for z, y, x in offsets])
+    around = jnp.pad(values, [(0, 0), (1, 1), (1, 1), (1, 1)])
+    for axis in (-1, -2, -3):
+        n = values.shape[axis]
+        around = jnp.stack([jax.lax.slice_in_dim(around, k, k + n, axis=around.ndim + axis) for k in range(3)])
     return around.reshape(3, 9, *values.shape)
 
 
