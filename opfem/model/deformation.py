@@ -137,8 +137,8 @@ def unstacked(A: Tensor) -> Entries:
 
 def product(A: Tensor, B: Tensor) -> Tensor:
     """Multiply two fields of 3×3 matrices, point by point."""
-    a, b = unstacked(A), unstacked(B)
-    return _stacked([[a[i][0] * b[0][k] + a[i][1] * b[1][k] + a[i][2] * b[2][k] for k in range(3)] for i in range(3)])
+    terms = [A[:, m, None] * B[None, m] for m in range(3)]
+    return terms[0] + terms[1] + terms[2]
 
 
 def cofactor(A: Tensor) -> Tensor:
