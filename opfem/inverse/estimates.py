@@ -51,6 +51,7 @@ def response(palpation: Palpation, thickness: ScalarLike, base: Base | None = No
     return transfer_function(k, thickness, material.shear, poisson_ratio(material), base)
 
 
+@eqx.filter_jit
 def solve_linear(palpation: Palpation, observation: Observation, prior: AbstractPrior) -> LeastSquares:
     """Find the white unknowns of the linear estimate."""
     mesh = palpation.mesh()

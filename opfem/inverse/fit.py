@@ -1,7 +1,7 @@
 """`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -14,7 +14,7 @@ from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
 from ..model import Contact, Palpation
-from ..solvers import Newton, Solution, solve
+from ..solvers import Newton, Solution
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .bed import Bed, lay_bed, no_bed
@@ -22,6 +22,7 @@ from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
+from .jacobian import Point
 from .misfit import Misfit, carried, moved, number_covariance, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
@@ -160,7 +161,7 @@ class _Reached(NamedTuple):
 
     white: Unknowns
     residuals: dict[str, Any]
-    aux: dict[str, Array]
+    point: Point
     posterior: Posterior
     result: FitStatus
 
@@ -196,22 +197,30 @@ class _Run:
             jnp.asarray(misfit.hopeless),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
-        state = _begin(gauss_newton, white, misfit)
+        state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):
-            white, state, done = _step(gauss_newton, white, misfit, state)
+            white, state = gauss_newton.look(self._evaluate, white, state)
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
             self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
+            done, _ = gauss_newton.terminate(None, white, misfit, {}, state, frozenset())
             result = _status(state, done)
             if result != FitStatus.max_steps_reached:
                 break
         self.iterations += int(state.descent_state.iterations)
-        self.steps += int(state.num_accepted_steps)
+        self.steps += state.num_accepted_steps
         J = state.f_info.jac
-        inverse = Learnt(eqx.filter_jit(descent.precondition)(J), state.descent_state.iterated)
-        posterior = Posterior(white, J, inverse)
-        return _Reached(white, state.f_info.residual, state.aux, posterior, result)
+        posterior = Posterior(white, J, Learnt(descent.precondition(J), state.descent_state.iterated))
+        return _Reached(white, state.f_info.residual, state.aux["point"], posterior, result)
+
+    def _evaluate(self, white: Unknowns) -> tuple[dict[str, Any], dict[str, Any], Callable]:
+        point = Point(self.misfit, white)
+        return (
+            point.residuals,
+            {"carried": point.carried, "followed": point.followed, "point": point},
+            point.jacobian,
+        )
 
 
 def _status(state: Any, done: Array) -> FitStatus:
@@ -251,26 +260,7 @@ def _settle(run: _Run, bed: Bed | None, given: Unknowns | None) -> _Reached:
     return reached
 
 
-def _misfit(white: Unknowns, misfit: Misfit):
-    return misfit(white)
-
-
 _observe = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
-
-
-# Compiled not for speed: the state holds a traced Jacobian, which counts as the same only if it is traced once.
-@eqx.filter_jit
-def _begin(solver, white, misfit):
-    structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
-    return solver.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
-
-
-@eqx.filter_jit
-def _step(solver, white, misfit, state):
-    # The auxiliary output that comes back is that of the point before.
-    white, state, _ = solver.step(_misfit, white, misfit, {}, state, frozenset())
-    done, _ = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
-    return white, state, done
 
 
 def _draw(posterior: Posterior, key: PRNGKeyArray):
@@ -306,11 +296,7 @@ def _result(
     reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: FitProgress
 ) -> TractionFit:
     misfit = run.misfit
-    palpation, loads = misfit.experiment(reached.white), misfit.tractions(reached.white)
-    solutions = [
-        solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
-        for i in range(loads.normal.shape[0])
-    ]
+    solutions = [way.solution(misfit.solver) for way in reached.point.ways]
     deviations, moves, whites, dof, iterations, cut_short = [], [], [], [], 0, 0
     for count, one in enumerate(jax.random.split(key, draws)):
         white, normal, move, determined, steps = _draw(reached.posterior, one)
@@ -322,8 +308,8 @@ def _result(
         cut_short += int(steps) >= MOST_ITERATIONS
         bar.drawn(count + 1, draws)
     deviations = jnp.stack(deviations)
-    pressures = _pressure_deviations(palpation, solutions, deviations, jnp.stack(moves))
-    residual = reached.aux["heights"] - misfit.observations.surface
+    pressures = _pressure_deviations(solutions, deviations, jnp.stack(moves))
+    residual = reached.point.heights - misfit.observations.surface
     points, widths = resolution(reached.posterior, misfit)
     numbers = {name: jnp.stack([white.numbers[name] for white in whites]) for name in misfit.parameters}
     solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
@@ -363,20 +349,19 @@ def _result(
 
 
 def _pressure_deviations(
-    palpation: Palpation,
-    solutions: list[Solution],
-    deviations: Float[Array, "draws maps my mx"],
-    moves: Float[Array, "draws maps 3 my mx"],
+    solutions: list[Solution], deviations: Float[Array, "draws maps my mx"], moves: Float[Array, "draws maps 3 my mx"]
 ) -> Float[Array, "draws maps my mx"]:
     """Turn deviations of the normal traction into those of the pressure on the current area [MPa]."""
+    each = [_changes(s, deviations[:, i], moves[:, i]) for i, s in enumerate(solutions)]
+    return jnp.stack(each, axis=1)
 
-    def of_map(i, solution):
-        def one(change, move):
-            return pressure_change(palpation, solution.traction, solution.displacement[:, -1], change, move)
 
-        return jax.vmap(one)(deviations[:, i], moves[:, i])
+@eqx.filter_jit
+def _changes(s: Solution, deviations: Float[Array, "draws my mx"], moves: Float[Array, "draws 3 my mx"]) -> Array:
+    def one(change, move):
+        return pressure_change(s.palpation, s.traction, s.displacement[:, -1], change, move)
 
-    return jnp.stack([of_map(i, solution) for i, solution in enumerate(solutions)], axis=1)
+    return jax.vmap(one)(deviations, moves)
 
 
 def _rms(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:

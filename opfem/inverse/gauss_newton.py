@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
 # A point is accepted where the least of the sum of squares along the way lies beyond this part of it; else the next is
@@ -63,6 +64,8 @@ def least_squares(
 ) -> LeastSquares:
     """Minimise |J x - b|² / 2 - further(Jᵀb) · x by conjugate gradients on the normal equations.
 
+    Driven from the host unless b is traced: each product is then a call.
+
     Args:
         jacobian: Multiply with J.
         transpose: Multiply with its transpose.
@@ -79,39 +82,86 @@ def least_squares(
         Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear;
         Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 for one that learns from the last system.
     """
-    like = jax.eval_shape(transpose, b)
-    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
-    zero, none = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like))), jnp.zeros((), int)
 
-    def unfinished(carry):
-        *_, size, first, count = carry
-        return (count == 0) | ((size > jnp.maximum(rtol**2 * first, negligible**2)) & (count <= most))
+    def iterate(it: _Iteration) -> _Iteration:
+        it = _along(it, jacobian(it.p))
+        return _turned(it, transpose(it.rest), precondition, further)
 
-    # The first pass only finds the gradient: so each product appears, and is compiled, once.
-    def iterate(carry):
-        x, rest, pulled, added, before, p, found, size, first, count = carry
-        q = jacobian(p)
-        squared = dot(q, q)
-        step = jnp.where(squared > 0, size / jnp.where(squared > 0, squared, 1.0), 0.0)
-        x, rest = plus(x, p, step), plus(rest, q, -step)
-        now = transpose(rest)
-        pulled = jax.tree.map(lambda new, old: jnp.where(count == 0, new, old), now, pulled)
-        if further is not None:
-            added = jax.lax.cond(count == 0, lambda: further(pulled), lambda: added)
-            now = plus(now, added)
-        if secants is None:
-            z = precondition(now)
-        else:
-            z = secants.corrected(precondition, now)
-            found = found.followed_by(jax.tree.map(lambda v: step * v, p), plus(before, now, -1.0))
-        new = dot(now, z)
-        change = new - dot(before, z)
-        p = plus(z, p, jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0))
-        return x, rest, pulled, added, now, p, found, new, jnp.where(count == 0, new, first), count + 1
+    def begin(like: PyTree) -> _Iteration:
+        zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
+        zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like)))
+        limits = (jnp.asarray(limit) for limit in (rtol, most, negligible))
+        return _Iteration(zeros, b, zeros, zeros, zeros, zeros, zeros, secants, zero, zero, jnp.zeros((), int), *limits)
 
-    start = (zeros, b, zeros, zeros, zeros, zeros, secants, zero, zero, none)
-    x, rest, pulled, *_, found, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
-    return LeastSquares(x, rest, pulled, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1, found)
+    if is_traced(b):
+        # The first pass only finds the gradient: so each product appears, and is compiled, once.
+        end = jax.lax.while_loop(_unfinished, iterate, begin(jax.eval_shape(transpose, b)))
+    else:
+        gradient = transpose(b)
+        end = _turned(begin(gradient), gradient, precondition, further)
+        while _unfinished(end):
+            end = iterate(end)
+    relative_gradient = jnp.sqrt(end.size / jnp.where(end.first > 0, end.first, 1.0))
+    return LeastSquares(end.x, end.rest, end.pulled, relative_gradient, end.count - 1, end.found)
+
+
+class _Iteration(NamedTuple):
+    x: PyTree
+    rest: PyTree
+    pulled: PyTree  # Jᵀb
+    added: PyTree  # what `further` adds to it
+    before: PyTree  # the last gradient
+    p: PyTree
+    moved: PyTree  # the last step along p
+    found: "Secants | None"
+    size: Array
+    first: Array
+    count: Array
+    rtol: Array
+    most: Array
+    negligible: Array
+
+
+def _unfinished(it: _Iteration) -> Array:
+    enough = jnp.maximum(it.rtol**2 * it.first, it.negligible**2)
+    return (it.count == 0) | ((it.size > enough) & (it.count <= it.most))
+
+
+@eqx.filter_jit
+def _along(it: _Iteration, q: PyTree) -> _Iteration:
+    """Go along p, whose product with J is q, as far as residuals fall."""
+    squared = dot(q, q)
+    step = jnp.where(squared > 0, it.size / jnp.where(squared > 0, squared, 1.0), 0.0)
+    moved = jax.tree.map(lambda v: step * v, it.p)
+    return it._replace(x=plus(it.x, moved), rest=plus(it.rest, q, -step), moved=moved)
+
+
+@eqx.filter_jit
+def _turned(it: _Iteration, now: PyTree, precondition: Callable, further: Callable | None) -> _Iteration:
+    """Find the next direction from the gradient."""
+    pulled = jax.tree.map(lambda new, old: jnp.where(it.count == 0, new, old), now, it.pulled)
+    added, found = it.added, it.found
+    if further is not None:
+        added = jax.lax.cond(it.count == 0, lambda: further(pulled), lambda: it.added)
+        now = plus(now, added)
+    if found is None:
+        z = precondition(now)
+    else:
+        # In the first pass `moved` is zero, and nothing is learnt.
+        z = found.corrected(precondition, now)
+        found = found.followed_by(it.moved, plus(it.before, now, -1.0))
+    new = dot(now, z)
+    change = new - dot(it.before, z)
+    p = plus(z, it.p, jnp.where(it.size > 0, change / jnp.where(it.size > 0, it.size, 1.0), 0.0))
+    first = jnp.where(it.count == 0, new, it.first)
+    return it._replace(
+        pulled=pulled, added=added, before=now, p=p, found=found, size=new, first=first, count=it.count + 1
+    )
+
+
+def is_traced(tree: PyTree) -> bool:
+    """Tell whether values are those of a trace."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def dot(a: PyTree, b: PyTree) -> Array:
@@ -199,6 +249,30 @@ class _Direction(eqx.Module):
     result: optx.RESULTS
 
 
+def _known(y: PyTree, state: _Direction, tries: Array, gradient: PyTree) -> Secants:
+    """Add the last step to what is known of the curvature; nothing is, once it is forgotten."""
+    known = state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
+    return jax.tree.map(lambda v: jnp.where(tries == 0, v, 0.0), known)
+
+
+def _curved(y: PyTree, state: _Direction, tries: Array, gradient: PyTree) -> PyTree:
+    """Compute what the curvature adds to the right-hand side of the linear system."""
+    return plus(_known(y, state, tries, gradient).before(gradient)[0], gradient, -1.0)
+
+
+@eqx.filter_jit
+def _direction(
+    y: PyTree, state: _Direction, tries: Array, residual: PyTree, solved: LeastSquares, iterations: Array
+) -> _Direction:
+    """Make the direction from the solution of the linear system."""
+    gradient = solved.gradient
+    known = _known(y, state, tries, gradient)
+    newton = known.after(solved.x, known.before(gradient)[1])
+    change = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
+    iterations = iterations + solved.iterations
+    return _Direction(newton, change, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful)
+
+
 class PreconditionedDescent(optx.AbstractDescent):
     """The Gauss–Newton direction.
 
@@ -227,7 +301,7 @@ class PreconditionedDescent(optx.AbstractDescent):
     def query(self, y, f_info, state):
         """Solve for the direction at an accepted point."""
         J, residual = f_info.jac, f_info.residual
-        most = jnp.where(f_info.as_min() < self.hopeless, self.most, 0)
+        most = jnp.where(0.5 * dot(residual, residual) < self.hopeless, self.most, 0)
         rtol = jnp.clip(state.change, self.rtol, _ROUGHEST)
         precondition = self.precondition(J)
 
@@ -239,26 +313,18 @@ class PreconditionedDescent(optx.AbstractDescent):
 
         def solve(carry):
             tries, last = carry
-
-            def secants(gradient):
-                known = state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
-                return jax.tree.map(lambda v: jnp.where(tries == 0, v, 0.0), known)
-
-            def further(gradient):
-                return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
-
+            further = eqx.Partial(_curved, y, state, tries)
             solved = least_squares(
                 J.mv, J.T.mv, precondition, residual, rtol, most, self.negligible, further, last.iterated
             )
-            gradient, known = solved.gradient, secants(solved.gradient)
-            newton = known.after(solved.x, known.before(gradient)[1])
-            change = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
-            iterations = last.iterations + solved.iterations
-            return tries + 1, _Direction(
-                newton, change, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful
-            )
+            return tries + 1, _direction(y, state, tries, residual, solved, last.iterations)
 
-        return jax.lax.while_loop(promises_too_much, solve, (jnp.zeros((), int), state))[1]
+        carry = jnp.zeros((), int), state
+        if is_traced((residual, state)):
+            return jax.lax.while_loop(promises_too_much, solve, carry)[1]
+        while promises_too_much(carry):
+            carry = solve(carry)
+        return carry[1]
 
     def step(self, step_size, state):
         """Go a part of the way."""
@@ -301,8 +367,20 @@ class Interpolating(optx.AbstractSearch):
         return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 
+class Looking(NamedTuple):
+    """How far Gauss–Newton has come; names as in the state of `optimistix.GaussNewton`."""
+
+    first_step: Array
+    y_eval: PyTree
+    search_state: _Search
+    f_info: optx.FunctionInfo | None
+    aux: Any
+    descent_state: _Direction
+    num_accepted_steps: int
+
+
 class GaussNewton(optx.AbstractGaussNewton):
-    """Gauss–Newton for `optimistix.least_squares`, or for stepping through it.
+    """Gauss–Newton for `optimistix.least_squares`, or driven from the host (`begin`, `look`).
 
     It ends where its next step would change the residuals by less than `rtol` of their norm: in a fit, about what is
     left to go over the posterior's standard deviations, root mean square. Their own change would be the wrong measure:
@@ -321,7 +399,46 @@ class GaussNewton(optx.AbstractGaussNewton):
         state = eqx.tree_at(lambda s: s.search_state.change, state, state.descent_state.change)
         return super().step(fn, y, args, options, state, tags)
 
+    def begin(self, y: PyTree) -> Looking:
+        """Start to look for the least from the host: what `init` does."""
+        return Looking(jnp.asarray(True), y, self.search.init(y, None), None, None, self.descent.init(y, None), 0)
+
+    def look(self, evaluate: Callable, y: PyTree, state: Looking) -> tuple[PyTree, Looking]:
+        """Do what `step` does, from the host: a solve or a product that takes long is then a program by itself.
+
+        Args:
+            evaluate: Computes, at a point, the residuals, what to keep with them, and how to make their Jacobian.
+            y: The point accepted last.
+            state: What came of the last look.
+        """
+        residual, aux, linearise = evaluate(state.y_eval)
+        before = None if state.f_info is None else state.f_info.residual
+        change = state.descent_state.change
+        accept, search_state = _searched(self.search, state.first_step, before, residual, change, state.search_state)
+        f_info, descent_state, accepted = state.f_info, state.descent_state, state.num_accepted_steps
+        if accept:
+            y, f_info, accepted = state.y_eval, optx.FunctionInfo.ResidualJac(residual, linearise()), accepted + 1
+            descent_state = self.descent.query(y, f_info, descent_state)
+        y_eval = _beside(self.descent, y, search_state.step_size, descent_state)
+        aux = aux if accept else state.aux
+        return y, Looking(jnp.asarray(False), y_eval, search_state, f_info, aux, descent_state, accepted)
+
     def terminate(self, fn, y, args, options, state, tags):
         """Tell whether the next step is small."""
         del fn, y, args, options, tags
         return state.descent_state.change <= self.rtol, optx.RESULTS.successful
+
+
+@eqx.filter_jit
+def _searched(
+    search: Interpolating, first_step: Array, before: PyTree, now: PyTree, change: Array, state: _Search
+) -> tuple[Array, _Search]:
+    """Tell whether a point is accepted, and how far to go next."""
+    infos = [optx.FunctionInfo.Residual(residual) for residual in (before, now)]
+    _, accept, _, state = search.step(first_step, None, None, *infos, eqx.tree_at(lambda s: s.change, state, change))
+    return accept, state
+
+
+@eqx.filter_jit
+def _beside(descent: PreconditionedDescent, y: PyTree, step_size: Array, state: _Direction) -> PyTree:
+    return plus(y, descent.step(step_size, state)[0])

@@ -64,17 +64,18 @@ def solve(
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
     traced = _is_traced((palpation, load, load_start, first, solver))
-    problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
+    problem, initial = prepare(palpation, load, load_start, solver, first, traced)
     run = _run_differentiable if traced else _run_with_progress
     stepping = run(problem, initial, solver, progress)
     if getattr(load, "correct_approach", False):
         problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, progress)
-    solution = _finish(problem, stepping, palpation, load)
+    solution = finish(problem, stepping, palpation, load)
     return _raise_on_failure(solution, traced) if throw else solution
 
 
 @eqx.filter_jit
-def _prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
+def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
+    """Discretise a palpation under a load, and begin at a state or at rest."""
     problem = discretise(palpation, load, load_start, solver.face_rule)
     initial = problem.initial_state()
     if state is None:
@@ -90,13 +91,13 @@ def _prepare(palpation, load, load_start, solver, state: State | None, traced: b
     return problem, begin(restarted, solver, traced)
 
 
-_attempt = eqx.filter_jit(attempt)
+compiled_attempt = eqx.filter_jit(attempt)
 
 
 def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, progress: bool) -> Stepping:
     with LoadProgress(progress) as bar:
         while bool(unfinished(stepping)):
-            stepping = _attempt(problem, stepping, solver)
+            stepping = compiled_attempt(problem, stepping, solver)
             s = stepping
             bar.show(float(s.state.fraction), int(s.attempts), int(s.newton), bool(s.viscosity > 0))
     return stepping
@@ -140,7 +141,8 @@ def _approach(problem: Problem, s: Stepping, load: Load) -> Array:
 
 
 @eqx.filter_jit
-def _finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+    """Make the solution from where a solve ended."""
     fields = recover(problem, s.before, s.state, load)
     result = outcome(s)
     ok = s.state.fraction >= 1.0
