@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
 from ..solvers import Solution
-from ..solvers.derivative import Handed, Slot, follow_path, linearise, pull, push
+from ..solvers.derivative import Handed, Slot, Solve, follow_path, linearise, pull, push
 from ..solvers.discretise import discretise
-from ..solvers.equilibrium import Problem, State
+from ..solvers.equilibrium import Problem
 from ..solvers.newton import Newton
 from ..solvers.solve import compiled_attempt, finish, prepare
 from ..solvers.stepping import Stepping, attempt, begin, unfinished
@@ -38,21 +38,18 @@ class Way(NamedTuple):
         load: The traction.
         problem: Both, discretised.
         end: Where the solve ended.
-        solves: State before and after each of those that led there, and the viscosity of the medium.
+        solves: Those that led there.
     """
 
     palpation: Palpation
     load: Traction
     problem: Problem
     end: Stepping
-    solves: list[tuple[State, State, Array]]
+    solves: list[Solve]
 
     def solution(self, solver: Newton) -> Solution:
         """Return the solution, first finding it where the solve was given up because of its length."""
-        s = self.end
-        while bool(unfinished(s)):
-            s = compiled_attempt(self.problem, s, solver)
-        return finish(self.problem, s, self.palpation, self.load)
+        return finish(self.problem, to_the_end(self.problem, self.end, solver), self.palpation, self.load)
 
 
 def press(palpation: Palpation, load: Traction, solver: Newton) -> Way:
@@ -66,14 +63,21 @@ def press(palpation: Palpation, load: Traction, solver: Newton) -> Way:
         solver: Settings.
     """
     problem, s = prepare(palpation, load, None, solver, None, False)
-    solves: list[tuple[State, State, Array]] = []
+    solves: list[Solve] = []
     while bool(unfinished(s)) and int(s.length) <= solver.max_path:
         before, s = s, compiled_attempt(problem, s, solver)
         if int(s.length) > int(before.length):
-            solves.append((before.origin, s.origin, before.viscosity))
+            solves.append(Solve(before.origin, s.origin, before.viscosity))
         else:
             del solves[int(s.length) :]
     return Way(palpation, load, problem, s, solves[: int(s.kept)])
+
+
+def to_the_end(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
+    """Go on with a solve until it ends."""
+    while bool(unfinished(s)):
+        s = compiled_attempt(problem, s, solver)
+    return s
 
 
 class Linearised(eqx.Module):
@@ -92,7 +96,7 @@ class Linearised(eqx.Module):
     @classmethod
     def along(cls, way: Way, solver: Newton) -> "Linearised":
         """Linearise a way, one solve after the other."""
-        return cls(way.problem, [linearise(way.problem, *solve) for solve in way.solves], solver)
+        return cls(way.problem, [Slot(solve, linearise(way.problem, solve)) for solve in way.solves], solver)
 
     def push(self, moved: Problem, first: Handed) -> Field:
         """Multiply a change of the problem, and of what the first solve starts from, with it."""

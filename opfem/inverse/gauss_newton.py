@@ -83,26 +83,34 @@ def least_squares(
         Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 for one that learns from the last system.
     """
 
-    def iterate(it: _Iteration) -> _Iteration:
+    def iterate(carry: tuple["_Iteration", "Secants | None"]) -> tuple["_Iteration", "Secants | None"]:
+        it, found = carry
         it = _along(it, jacobian(it.p))
-        return _turned(it, transpose(it.rest), precondition, further)
+        return turn(it, transpose(it.rest), found)
 
-    def begin(like: PyTree) -> _Iteration:
+    def turn(it: "_Iteration", gradient: PyTree, found: "Secants | None") -> tuple["_Iteration", "Secants | None"]:
+        if further is not None:
+            it = _with_added(it, gradient, further)
+        turned = _turned(it, gradient, precondition if found is None else Learnt(precondition, found))
+        return turned, None if found is None else _learnt(found, it, turned)
+
+    def begin(like: PyTree) -> "_Iteration":
         zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
         zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like)))
         limits = (jnp.asarray(limit) for limit in (rtol, most, negligible))
-        return _Iteration(zeros, b, zeros, zeros, zeros, zeros, zeros, secants, zero, zero, jnp.zeros((), int), *limits)
+        return _Iteration(zeros, b, zeros, zeros, zeros, zeros, zeros, zero, zero, jnp.zeros((), int), *limits)
 
     if is_traced(b):
         # The first pass only finds the gradient: so each product appears, and is compiled, once.
-        end = jax.lax.while_loop(_unfinished, iterate, begin(jax.eval_shape(transpose, b)))
+        start = begin(jax.eval_shape(transpose, b)), secants
+        end, found = jax.lax.while_loop(lambda carry: _unfinished(carry[0]), iterate, start)
     else:
         gradient = transpose(b)
-        end = _turned(begin(gradient), gradient, precondition, further)
+        end, found = turn(begin(gradient), gradient, secants)
         while _unfinished(end):
-            end = iterate(end)
+            end, found = iterate((end, found))
     relative_gradient = jnp.sqrt(end.size / jnp.where(end.first > 0, end.first, 1.0))
-    return LeastSquares(end.x, end.rest, end.pulled, relative_gradient, end.count - 1, end.found)
+    return LeastSquares(end.x, end.rest, end.pulled, relative_gradient, end.count - 1, found)
 
 
 class _Iteration(NamedTuple):
@@ -113,7 +121,6 @@ class _Iteration(NamedTuple):
     before: PyTree  # the last gradient
     p: PyTree
     moved: PyTree  # the last step along p
-    found: "Secants | None"
     size: Array
     first: Array
     count: Array
@@ -122,6 +129,7 @@ class _Iteration(NamedTuple):
     negligible: Array
 
 
+@eqx.filter_jit
 def _unfinished(it: _Iteration) -> Array:
     enough = jnp.maximum(it.rtol**2 * it.first, it.negligible**2)
     return (it.count == 0) | ((it.size > enough) & (it.count <= it.most))
@@ -137,26 +145,32 @@ def _along(it: _Iteration, q: PyTree) -> _Iteration:
 
 
 @eqx.filter_jit
-def _turned(it: _Iteration, now: PyTree, precondition: Callable, further: Callable | None) -> _Iteration:
-    """Find the next direction from the gradient."""
-    pulled = jax.tree.map(lambda new, old: jnp.where(it.count == 0, new, old), now, it.pulled)
-    added, found = it.added, it.found
-    if further is not None:
-        added = jax.lax.cond(it.count == 0, lambda: further(pulled), lambda: it.added)
-        now = plus(now, added)
-    if found is None:
-        z = precondition(now)
-    else:
-        # In the first pass `moved` is zero, and nothing is learnt.
-        z = found.corrected(precondition, now)
-        found = found.followed_by(it.moved, plus(it.before, now, -1.0))
+def _with_added(it: _Iteration, gradient: PyTree, further: Callable) -> _Iteration:
+    """Find in the first pass what is to be added to the right-hand side."""
+    return it._replace(added=jax.lax.cond(it.count == 0, lambda: further(gradient), lambda: it.added))
+
+
+@eqx.filter_jit
+def _turned(it: _Iteration, gradient: PyTree, precondition: Callable) -> _Iteration:
+    """Find the next direction."""
+    now = plus(gradient, it.added)
+    z = precondition(now)
     new = dot(now, z)
     change = new - dot(it.before, z)
-    p = plus(z, it.p, jnp.where(it.size > 0, change / jnp.where(it.size > 0, it.size, 1.0), 0.0))
-    first = jnp.where(it.count == 0, new, it.first)
     return it._replace(
-        pulled=pulled, added=added, before=now, p=p, found=found, size=new, first=first, count=it.count + 1
+        pulled=jax.tree.map(lambda new, old: jnp.where(it.count == 0, new, old), gradient, it.pulled),
+        before=now,
+        p=plus(z, it.p, jnp.where(it.size > 0, change / jnp.where(it.size > 0, it.size, 1.0), 0.0)),
+        size=new,
+        first=jnp.where(it.count == 0, new, it.first),
+        count=it.count + 1,
     )
+
+
+@eqx.filter_jit
+def _learnt(found: "Secants", it: _Iteration, turned: _Iteration) -> "Secants":
+    """Learn of JᵀJ from the last step; in the first pass there was none."""
+    return found.followed_by(it.moved, plus(it.before, turned.before, -1.0))
 
 
 def is_traced(tree: PyTree) -> bool:

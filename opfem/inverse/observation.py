@@ -155,8 +155,7 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
 
     at = jax.lax.fori_loop(0, 2 * _LOCATING_STEPS, closer, place)
     # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
-    for _ in range(2):
-        at = at + newton(at, moved, found)[1]
+    at = jax.lax.fori_loop(0, 2, lambda _, at: at + newton(at, moved, found)[1], at)
     return height(*at)[0]
 
 

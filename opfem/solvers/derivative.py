@@ -87,27 +87,27 @@ class Handed(NamedTuple):
     histories: Bodies  # of SlipHistory
 
 
-class Slot(NamedTuple):
-    """One solve of a path, and what products with its derivative need.
-
-    Attributes:
-        before: The state that it started from.
-        after: The state that it found.
-        viscosity: Of the medium [-].
-        tangent: Of its balance.
-    """
+class Solve(NamedTuple):
+    """One solve of a path: the states before and after, and the viscosity of the medium [-]."""
 
     before: State
     after: State
     viscosity: Array
+
+
+class Slot(NamedTuple):
+    """One solve of a path, and the tangent of its balance."""
+
+    solve: Solve
     tangent: Tangent
 
 
 @eqx.filter_jit
-def linearise(problem: Problem, before: State, after: State, viscosity: Array) -> Slot:
+def linearise(problem: Problem, solve: Solve) -> Tangent:
     """Keep the tangent and the multigrid of one solve, so that a product costs little more than a linear solve."""
+    before, after, viscosity = solve
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, viscosity)
-    return Slot(before, after, viscosity, slowed.tangent(after.unknowns, after.fraction, before, Bodies()))
+    return slowed.tangent(after.unknowns, after.fraction, before, Bodies())
 
 
 def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed, settings: Newton) -> Handed:
@@ -122,7 +122,13 @@ def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed,
         first: Change of what the first solve is handed.
         settings: Settings of the solve.
     """
-    return _through(lambda change, slot: _push(problem, slot, moved, change, settings), first, slots)
+
+    def through(change: Handed, slot: Slot) -> Handed:
+        off = _off_balance(problem, slot.solve, moved, change)
+        step = _solve_kept(problem, slot, off, jnp.asarray(False), settings)
+        return _hand_on(problem, slot.solve, moved, change, step)
+
+    return _through(through, first, slots)
 
 
 def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Nodal, settings: Newton) -> Problem:
@@ -135,13 +141,19 @@ def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Noda
         weights: Of the displacement.
         settings: Settings of the solve.
     """
+
+    def through(carry: tuple[Problem, Handed], slot: Slot) -> tuple[Problem, Handed]:
+        so_far, of_step = _pull_hand_on(problem, slot.solve, *carry)
+        step = _solve_kept(problem, slot, of_step, jnp.asarray(True), settings)
+        return _pull_off_balance(problem, slot.solve, *so_far, step)
+
     nothing = jax.tree.map(jnp.zeros_like, eqx.filter(problem, varies))
     if not slots:
         return nothing
-    after = slots[-1].after
+    after = slots[-1].solve.after
     last = jax.tree.map(jnp.zeros_like, Handed(after.unknowns, after.histories))
     last = last._replace(unknowns=last.unknowns._replace(u=weights))
-    return _through(lambda w, slot: _pull(problem, slot, *w, settings), (nothing, last), slots, reverse=True)[0]
+    return _through(through, (nothing, last), slots, reverse=True)[0]
 
 
 def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: bool = False) -> Any:
@@ -154,61 +166,81 @@ def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: boo
     return carry
 
 
-@eqx.filter_jit
-def _push(problem: Problem, slot: Slot, moved: Problem, change: Handed, settings: Newton) -> Handed:
-    varies = jax.tree.map(lambda leaf: leaf is not None, moved, is_leaf=lambda leaf: leaf is None)
-    equations = _Equations(problem, slot)
-    at = (eqx.filter(problem, varies), equations.handed)
-    _, off = jax.jvp(equations.balance, at, (moved, change))
-    step = jax.tree.map(jnp.negative, equations.solve(off, False, settings))
-    x = slot.after.unknowns
-    return jax.jvp(equations.hand_on, (*at, x), (moved, change, step))[1]
-
-
-@eqx.filter_jit
-def _pull(problem: Problem, slot: Slot, so_far: Problem, weights: Handed, settings: Newton) -> tuple[Problem, Handed]:
-    varies = jax.tree.map(lambda leaf: leaf is not None, so_far, is_leaf=lambda leaf: leaf is None)
-    equations = _Equations(problem, slot)
-    at = (eqx.filter(problem, varies), equations.handed)
-    *direct, of_x = jax.vjp(equations.hand_on, *at, slot.after.unknowns)[1](weights)
-    solved = jax.tree.map(jnp.negative, equations.solve(of_x, True, settings))
-    through = jax.vjp(equations.balance, *at)[1](solved)
-    of_problem, of_handed = jax.tree.map(jnp.add, tuple(direct), through)
-    return jax.tree.map(jnp.add, so_far, of_problem), of_handed
-
-
 class _Equations:
     """The equations of one solve, as functions of what varies of the problem and of what it was handed."""
 
-    def __init__(self, problem: Problem, slot: Slot):
-        self.problem = eqx.tree_at(lambda p: p.viscosity, problem, slot.viscosity)
-        self.slot = slot
-        self.handed = Handed(slot.before.unknowns, slot.before.histories)
+    def __init__(self, problem: Problem, solve: Solve, varied: Problem):
+        varies = jax.tree.map(lambda leaf: leaf is not None, varied, is_leaf=lambda leaf: leaf is None)
+        self.problem = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
+        self.solve = solve
+        self.at = eqx.filter(problem, varies), Handed(solve.before.unknowns, solve.before.histories)
 
     def _start(self, handed: Handed) -> State:
         u, mean_stress = handed.unknowns
-        return dataclasses.replace(self.slot.before, u=u, mean_stress=mean_stress, histories=handed.histories)
+        return dataclasses.replace(self.solve.before, u=u, mean_stress=mean_stress, histories=handed.histories)
 
     def balance(self, varied: Problem, handed: Handed) -> Unknowns:
         """Compute what is out of balance at the state found."""
-        after = self.slot.after
+        after = self.solve.after
         problem = eqx.combine(varied, self.problem)
         return problem.balance(after.unknowns, after.fraction, self._start(handed), after.held)
 
     def hand_on(self, varied: Problem, handed: Handed, x: Unknowns) -> Handed:
         """Compute what the next solve is handed."""
-        after = self.slot.after
+        after = self.solve.after
         # Only the work takes forces, and nothing takes the work.
         forces = Forces(jnp.zeros_like(x.u), None, after.applied, None, jnp.ones(()))
         state = eqx.combine(varied, self.problem).advance(x, after.fraction, self._start(handed), after.held, forces)
         return Handed(x, state.histories)
 
-    def solve(self, b: Unknowns, transposed: bool, settings: Newton) -> Unknowns:
-        """Solve with the kept tangent or its transpose; NaN where that fails."""
-        settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_KEPT_RTOL))
-        tangent = self.slot.tangent.transposed() if transposed else self.slot.tangent
-        x, remaining = _correction(self.problem, tangent, transposed, self.slot.after.held, b, settings)
-        return jax.tree.map(lambda v: jnp.where(remaining <= _KEPT_MOST, v, jnp.nan), x)
+
+@eqx.filter_jit
+def _off_balance(problem: Problem, solve: Solve, moved: Problem, change: Handed) -> Unknowns:
+    """Compute the change of the balance at the state found, less than nothing: what the next step makes up for."""
+    equations = _Equations(problem, solve, moved)
+    return jax.tree.map(jnp.negative, jax.jvp(equations.balance, equations.at, (moved, change))[1])
+
+
+@eqx.filter_jit
+def _hand_on(problem: Problem, solve: Solve, moved: Problem, change: Handed, step: Unknowns) -> Handed:
+    """Compute the change of what the next solve is handed."""
+    equations = _Equations(problem, solve, moved)
+    at = (*equations.at, solve.after.unknowns)
+    return jax.jvp(equations.hand_on, at, (moved, change, step))[1]
+
+
+@eqx.filter_jit
+def _pull_hand_on(
+    problem: Problem, solve: Solve, so_far: Problem, weights: Handed
+) -> tuple[tuple[Problem, Handed], Unknowns]:
+    """Multiply with the transpose of `_hand_on`."""
+    equations = _Equations(problem, solve, so_far)
+    pulled = jax.vjp(equations.hand_on, *equations.at, solve.after.unknowns)[1](weights)
+    of_problem, of_handed, of_step = pulled
+    return (jax.tree.map(jnp.add, so_far, of_problem), of_handed), of_step
+
+
+@eqx.filter_jit
+def _pull_off_balance(
+    problem: Problem, solve: Solve, so_far: Problem, of_handed: Handed, step: Unknowns
+) -> tuple[Problem, Handed]:
+    """Multiply with the transpose of `_off_balance`."""
+    equations = _Equations(problem, solve, so_far)
+    pulled = jax.vjp(equations.balance, *equations.at)[1](step)
+    return jax.tree.map(jnp.subtract, (so_far, of_handed), pulled)
+
+
+@eqx.filter_jit
+def _solve_kept(problem: Problem, slot: Slot, b: Unknowns, transposed: Array, settings: Newton) -> Unknowns:
+    """Solve with a kept tangent or its transpose, by one program; NaN where that fails.
+
+    Both are preconditioned from the left, as the transpose must be (`solve_tangent`).
+    """
+    settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_KEPT_RTOL))
+    tangent = slot.tangent
+    tangent = jax.tree.map(lambda new, old: jnp.where(transposed, new, old), tangent.transposed(), tangent)
+    x, remaining = _correction(problem, tangent, True, slot.solve.after.held, b, settings)
+    return jax.tree.map(lambda v: jnp.where(remaining <= _KEPT_MOST, v, jnp.nan), x)
 
 
 def _solve(
