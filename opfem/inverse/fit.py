@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from .data import AxialDisplacement, ForceReading
 from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
-from .jacobian import Point
+from .jacobian import Point, programs
 from .misfit import Misfit, carried, moved, number_covariance, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
@@ -142,7 +143,11 @@ def fit_traction(
     with FitProgress(progress) as bar:
         run = _Run(misfit, rtol, max_steps, bar)
         given = None if start is None else from_normal(start, misfit)
-        bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
+        with ThreadPoolExecutor() as pool:  # XLA compiles outside of Python's lock
+            compiled = [pool.submit(_compile, *one) for one in programs(misfit, misfit.white(observations.surface))]
+            bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
+        for one in compiled:
+            one.result()
         reached = _settle(run, bed, given)
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
@@ -154,6 +159,10 @@ def fit_traction(
     if judged and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
     return fit
+
+
+def _compile(function: Any, arguments: tuple) -> None:
+    function.lower(*arguments).compile()
 
 
 class _Reached(NamedTuple):

@@ -5,6 +5,7 @@ are one program each: steps of the fit, inner iterations, draws and all else tha
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,9 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
-from ..solvers.derivative import Handed
+from ..solvers import derivative
+from ..solvers.derivative import Handed, Solve
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
+from ..solvers.solve import compiled_attempt, finish, prepare
 from .forward import Linearised, of_load, press
 from .gauss_newton import dot, plus
 from .misfit import Misfit
@@ -121,6 +124,32 @@ class Transposed(eqx.Module):
     def mv(self, weights: dict[str, Any]) -> Unknowns:
         """Multiply with it."""
         return self.jacobian.transposed_mv(weights)
+
+
+def programs(misfit: Misfit, white: Unknowns) -> list[tuple[Callable, tuple]]:
+    """List what a fit compiles, the longest first, with arguments of the right shapes, to compile it early."""
+    i, maps = jnp.arange(1)[0], white.normal.shape[0]
+    palpation, load = _experiment(misfit, white, i)
+    problem, start = prepare(palpation, load, None, misfit.solver, None, False)
+    u, reached = jnp.stack([start.state.u] * maps), jnp.stack([start.state.fraction] * maps)
+    at = _At(misfit, white, u, reached)
+    (residuals, _), (moved, first) = _zeros(_residuals, at), _zeros(_of_problem, at, white, i)
+    solve = Solve(start.origin, start.origin, start.viscosity)
+    varies = of_load(problem)
+    return [
+        (compiled_attempt, (problem, start, misfit.solver)),
+        *derivative.programs(problem, solve, moved, first, varies, misfit.solver),
+        (finish, (problem, start, palpation, load)),
+        (_pulled_to_u, (at, residuals)),
+        (_of_residuals, (at, white, u)),
+        (_residuals, (at,)),
+        (_of_problem, (at, white, i)),
+        (_pulled_to_white, (at, eqx.filter(problem, varies), i, white)),
+    ]
+
+
+def _zeros(function: Callable, *arguments: Any) -> Any:
+    return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), eqx.filter_eval_shape(function, *arguments))
 
 
 @eqx.filter_jit

@@ -82,6 +82,7 @@ class Misfit(eqx.Module):
         """Keep tractions above zero, where that is asked for."""
         return latent if self.softness is None else self.softness * jax.nn.softplus(latent / self.softness)
 
+    @eqx.filter_jit
     def white(self, normal: Float[Array, "maps my mx"]) -> Unknowns:
         """Find unknowns that ask for normal tractions [MPa], the others at their priors' centres."""
         maps, *shape = normal.shape

@@ -156,6 +156,22 @@ def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Noda
     return _through(through, (nothing, last), slots, reverse=True)[0]
 
 
+def programs(
+    problem: Problem, solve: Solve, moved: Problem, first: Handed, varies: Problem, settings: Newton
+) -> list[tuple[Callable, tuple]]:
+    """List what `linearise`, `push` and `pull` compile, with arguments of the right shapes, to compile it early."""
+    tangent = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), eqx.filter_eval_shape(linearise, problem, solve))
+    step, yes, varied = solve.after.unknowns, jnp.asarray(True), eqx.filter(problem, varies)
+    return [
+        (linearise, (problem, solve)),
+        (_solve_kept, (problem, Slot(solve, tangent), step, yes, settings)),
+        (_off_balance, (problem, solve, moved, first)),
+        (_hand_on, (problem, solve, moved, first, step)),
+        (_pull_hand_on, (problem, solve, varied, first)),
+        (_pull_off_balance, (problem, solve, varied, first, step)),
+    ]
+
+
 def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: bool = False) -> Any:
     """Go through slots, each by the one compiled program; where values are traced, by a scan."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((carry, slots))) and slots:

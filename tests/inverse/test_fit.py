@@ -220,11 +220,28 @@ def small():
 
 def small_map(small, seed=0, load=1.0, mask=None):
     experiment, settings, _, known = small
-    u = op.solve(experiment, op.Traction(load * known), settings).displacement[:, -1]
+    # Springs without stiffness: the fit's own program solves it.
+    u = op.solve(experiment, op.Traction(load * known, stiffness=0.0), settings).displacement[:, -1]
     basis, _ = _spline_values(jnp.linspace(0.0, 6.0, 31), 6)
     heights = basis @ interface_heights(experiment.mesh(), u) @ basis.T
     noise = NOISE * np.random.default_rng(seed).standard_normal(heights.shape)
     return op.ThicknessMap(heights + noise, extent=(SIDE, SIDE), std=NOISE, mask=mask)
+
+
+def test_small_fit_finds_the_traction_and_knows_how_well(small):
+    experiment, settings, prior, known = small
+    fit = op.fit_traction(experiment, small_map(small), prior, solver=settings, draws=8, progress=False)
+    assert fit.result == op.FitStatus.successful
+    assert jnp.linalg.norm(fit.normal - known) < 0.1 * jnp.linalg.norm(known - known.mean())
+    # About 40 degrees of freedom, and standard deviations from 8 draws.
+    z = (fit.normal - known) / fit.normal_std
+    assert 0.6 < float(jnp.sqrt(jnp.mean(z**2))) < 1.6
+    left = fit.observed - fit.effective_dof
+    assert abs(fit.chi2 - left) < 3.0 * jnp.sqrt(2.0 * left)
+    assert jnp.all(fit.pressure_std > 0.2 * fit.normal_std)
+    assert jnp.all(fit.resolution_width > 0.25)
+    assert not fit.unobserved()
+    assert fit.stats["inner_iterations"] <= 6 * fit.stats["gauss_newton_steps"]
 
 
 @pytest.mark.slow
