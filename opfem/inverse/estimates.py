@@ -10,7 +10,7 @@ from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
 from ..model.deformation import kinematics
 from ..model.material import AbstractMaterial
-from .gauss_newton import LeastSquares, least_squares
+from .conjugate_gradients import LeastSquares, least_squares
 from .noise import noise_std
 from .observation import Nodes, Observation, observe
 from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes

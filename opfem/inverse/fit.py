@@ -19,8 +19,9 @@ from ..solvers import Newton, Solution
 from ..solvers.progress import FitProgress
 from ..solvers.solve import require_float64
 from .bed import Bed, lay_bed, no_bed
+from .conjugate_gradients import Learnt
 from .data import AxialDisplacement, ForceReading
-from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
+from .gauss_newton import GaussNewton, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
 from .jacobian import Point, programs

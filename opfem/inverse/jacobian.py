@@ -19,8 +19,8 @@ from ..solvers.derivative import Handed, Solve
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
 from ..solvers.solve import compiled_attempt, finish, prepare
+from .conjugate_gradients import dot, plus
 from .forward import Linearised, of_load, press
-from .gauss_newton import dot, plus
 from .misfit import Misfit
 from .preconditioner import Unknowns
 

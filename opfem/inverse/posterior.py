@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._checks import concrete
-from .gauss_newton import LeastSquares, is_traced, least_squares, plus
+from .conjugate_gradients import LeastSquares, is_traced, least_squares, plus
 
 # Most iterations of each linear system, and the relative gradient that it is solved to.
 MOST_ITERATIONS = 200

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import Bonded, Palpation
+from .conjugate_gradients import dot, plus
 from .estimates import response
-from .gauss_newton import dot, plus
 from .observation import Nodes, Observation
 from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
 from .transfer import wave_numbers
