@@ -214,8 +214,7 @@ class _Run:
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
             self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
-            done, _ = gauss_newton.terminate(None, white, misfit, {}, state, frozenset())
-            result = _status(state, done)
+            result = _status(state, gauss_newton.settled(state))
             if result != FitStatus.max_steps_reached:
                 break
         self.iterations += int(state.descent_state.iterations)

@@ -166,7 +166,7 @@ class Looking(NamedTuple):
     first_step: Array
     y_eval: PyTree
     search_state: _Search
-    f_info: optx.FunctionInfo | None
+    f_info: Any  # None before the first look
     aux: Any
     descent_state: _Direction
     num_accepted_steps: int
@@ -219,7 +219,11 @@ class GaussNewton(optx.AbstractGaussNewton):
     def terminate(self, fn, y, args, options, state, tags):
         """Tell whether the next step is small."""
         del fn, y, args, options, tags
-        return state.descent_state.change <= self.rtol, optx.RESULTS.successful
+        return self.settled(state), optx.RESULTS.successful
+
+    def settled(self, state: Any) -> Array:
+        """Tell whether the next step is small."""
+        return state.descent_state.change <= self.rtol
 
 
 @eqx.filter_jit
@@ -227,8 +231,9 @@ def _searched(
     search: Interpolating, first_step: Array, before: PyTree, now: PyTree, change: Array, state: _Search
 ) -> tuple[Array, _Search]:
     """Tell whether a point is accepted, and how far to go next."""
-    infos = [optx.FunctionInfo.Residual(residual) for residual in (before, now)]
-    _, accept, _, state = search.step(first_step, None, None, *infos, eqx.tree_at(lambda s: s.change, state, change))
+    old, new = (optx.FunctionInfo.Residual(residual) for residual in (before, now))
+    last = eqx.tree_at(lambda s: s.change, state, change)
+    _, accept, _, state = search.step(first_step, None, None, old, new, last)
     return accept, state
 
 
