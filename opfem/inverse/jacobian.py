@@ -144,7 +144,7 @@ def programs(misfit: Misfit, white: Unknowns) -> list[tuple[Callable, tuple]]:
         (_of_residuals, (at, white, u)),
         (_residuals, (at,)),
         (_of_problem, (at, white, i)),
-        (_pulled_to_white, (at, eqx.filter(problem, varies), i, white)),
+        (_pulled_to_white, (at, eqx.filter(problem, varies), i, white._replace(numbers={}))),
     ]
 
 
