@@ -80,7 +80,7 @@ def least_squares(
     def begin(like: PyTree) -> "_Iteration":
         zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
         zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like)))
-        limits = (jnp.asarray(limit) for limit in (rtol, most, negligible))
+        limits = (jnp.asarray(limit, zero.dtype) for limit in (rtol, most, negligible))
         return _Iteration(zeros, b, zeros, zeros, zeros, zeros, zeros, zero, zero, jnp.zeros((), int), *limits)
 
     if is_traced(b):
