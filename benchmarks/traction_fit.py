@@ -32,7 +32,7 @@ from jax import monitoring
 from scipy.interpolate import RectBivariateSpline
 
 import opfem as op
-from opfem.inverse.gauss_newton import least_squares, plus
+from opfem.inverse.conjugate_gradients import least_squares, plus
 from opfem.inverse.observation import interface_heights
 
 C10, C01, BULK = 2.23e-3, 7.03e-4, 0.11732  # MPa

@@ -14,9 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
+from ..mechanics.face import tributary_area
 from ..model import Imprint, Palpation
-from ..solvers import Newton, Solution, solve
+from ..solvers import Newton
+from ..solvers.compiling import QuickJit
 from ..solvers.solution import is_failure
+from ..solvers.solve import prepare
+from ..solvers.stepping import Stepping, outcome
+from .forward import to_the_end
 from .observation import Observation
 from .preconditioner import fit_normal, indentation
 from .prior import AbstractPrior
@@ -72,21 +77,28 @@ def lay_bed(bed: Bed, palpation: Palpation, observations: Observation, solver: N
     """Stiffen a bed, at rest about imprints of the maps; None where the layer does not take the imprint."""
     maps = observations.surface.shape[0]
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], observations) for i in range(maps)]
-    solutions = [_imprint(palpation, observation, solver) for observation in each]
-    if any(bool(is_failure(solution.result)) for solution in solutions):
+    few = dataclasses.replace(solver, max_increments=min(solver.max_increments, _MOST_ATTEMPTS)).as_leaves()
+    ends = [_imprinted(palpation, _imprint(palpation, observation), few) for observation in each]
+    if any(bool(is_failure(outcome(s))) for s in ends):
         return None
     stiffness = _STIFFNESS * palpation.layer.material.shear / jnp.mean(palpation.mesh().thickness)
-    normal = jnp.stack([-solution.traction[2] for solution in solutions])
-    uz = jnp.stack([solution.displacement[2, -1] for solution in solutions])
+    area = tributary_area(palpation.mesh().positions()[:, -1])
+    normal = -jnp.stack([s.state.applied.sample.face[2] for s in ends]) / area
+    uz = jnp.stack([s.state.u[2, -1] for s in ends])
     return Bed(stiffness, normal, uz, bed.gain, bed.softness)
 
 
-def _imprint(palpation: Palpation, observation: Observation, solver: Newton) -> Solution:
+def _imprinted(palpation: Palpation, load: Imprint, solver: Newton) -> Stepping:
+    problem, start = prepare(palpation, load, None, solver, None, False)
+    return to_the_end(problem, start, solver)
+
+
+@QuickJit
+def _imprint(palpation: Palpation, observation: Observation) -> Imprint:
     # Where few pixels count, splines run away: filled in from around.
     rows, columns = jnp.abs(observation.to_rows).T, jnp.abs(observation.to_columns)
     counted = rows @ (observation.certainty > 0) @ columns
     told = counted >= _TOLD * (jnp.sum(rows, axis=1)[:, None] * jnp.sum(columns, axis=0))
     least = _LEAST * jnp.mean(palpation.mesh().thickness)
     surface = ThicknessMap(jnp.maximum(observation.surface, least), extent=palpation.extent, mask=~told)
-    few = dataclasses.replace(solver, max_increments=min(solver.max_increments, _MOST_ATTEMPTS))
-    return solve(palpation, Imprint(surface.filled()), few, throw=False, progress=False)
+    return Imprint(surface.filled())

@@ -10,7 +10,8 @@ from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
 from ..model.deformation import kinematics
 from ..model.material import AbstractMaterial
-from .gauss_newton import LeastSquares, least_squares
+from ..solvers.compiling import QuickJit
+from .conjugate_gradients import LeastSquares, least_squares
 from .noise import noise_std
 from .observation import Nodes, Observation, observe
 from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes
@@ -51,6 +52,7 @@ def response(palpation: Palpation, thickness: ScalarLike, base: Base | None = No
     return transfer_function(k, thickness, material.shear, poisson_ratio(material), base)
 
 
+@QuickJit
 def solve_linear(palpation: Palpation, observation: Observation, prior: AbstractPrior) -> LeastSquares:
     """Find the white unknowns of the linear estimate."""
     mesh = palpation.mesh()

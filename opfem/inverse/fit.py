@@ -1,7 +1,7 @@
 """`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -14,14 +14,17 @@ from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
 from ..model import Contact, Palpation
-from ..solvers import Newton, Solution, solve
-from ..solvers.progress import FitProgress
+from ..solvers import Newton, Solution
+from ..solvers.compiling import QuickJit, compiled_meanwhile
+from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
 from .bed import Bed, lay_bed, no_bed
+from .conjugate_gradients import Learnt
 from .data import AxialDisplacement, ForceReading
-from .gauss_newton import GaussNewton, Learnt, PreconditionedDescent
+from .gauss_newton import GaussNewton, PreconditionedDescent
 from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
+from .jacobian import Point, programs
 from .misfit import Misfit, carried, moved, number_covariance, pressure_change
 from .observation import observe
 from .parameters import AbstractNumberPrior
@@ -45,6 +48,7 @@ _PRESSED = 1e-4
 _LEAST_PART = 5e-3
 # A non-negative pressure bends towards zero below this part of the shear modulus.
 _SOFTNESS = 0.05
+_COMPILES = "the programs of a fit, about a minute the first time"
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
 _MOST_CHOICES = 8
 _CHOSEN = 0.05
@@ -138,10 +142,12 @@ def fit_traction(
         solver=solver.as_leaves(),
     )
     key = jax.random.key(0) if key is None else key
-    with FitProgress(progress) as bar:
+    with Progress(progress) as bar:
+        bar.stage("imprint", compiles=_COMPILES)
         run = _Run(misfit, rtol, max_steps, bar)
         given = None if start is None else from_normal(start, misfit)
-        bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
+        with compiled_meanwhile(programs(misfit, misfit.white(observations.surface))):
+            bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
         reached = _settle(run, bed, given)
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
@@ -160,7 +166,7 @@ class _Reached(NamedTuple):
 
     white: Unknowns
     residuals: dict[str, Any]
-    aux: dict[str, Array]
+    point: Point
     posterior: Posterior
     result: FitStatus
 
@@ -181,7 +187,7 @@ def _pressed(reached: _Reached, palpation: Palpation) -> Array:
 class _Run:
     """A fit in progress: what it fits, and what it has spent."""
 
-    def __init__(self, misfit: Misfit, rtol: float, max_steps: int, bar: FitProgress):
+    def __init__(self, misfit: Misfit, rtol: float, max_steps: int, bar: Progress):
         self.misfit, self.rtol, self.max_steps, self.bar = misfit, rtol, max_steps, bar
         self.solves, self.iterations, self.steps = 0, 0, 0
 
@@ -196,22 +202,30 @@ class _Run:
             jnp.asarray(misfit.hopeless),
         )
         gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
-        state = _begin(gauss_newton, white, misfit)
+        state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):
-            white, state, done = _step(gauss_newton, white, misfit, state)
+            white, state = gauss_newton.look(self._evaluate, white, state)
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
-            self.bar.show(self.solves, float(state.f_info.as_min()), inner, float(state.descent_state.change))
-            result = _status(state, done)
+            loss, left = float(state.f_info.as_min()), float(state.descent_state.change)
+            self.bar.show(f"step {self.solves}, misfit {loss:.5g}, {inner} inner iterations, {left:.2g} to go")
+            result = _status(state, gauss_newton.settled(state))
             if result != FitStatus.max_steps_reached:
                 break
         self.iterations += int(state.descent_state.iterations)
-        self.steps += int(state.num_accepted_steps)
+        self.steps += state.num_accepted_steps
         J = state.f_info.jac
-        inverse = Learnt(eqx.filter_jit(descent.precondition)(J), state.descent_state.iterated)
-        posterior = Posterior(white, J, inverse)
-        return _Reached(white, state.f_info.residual, state.aux, posterior, result)
+        posterior = Posterior(white, J, Learnt(descent.precondition(J), state.descent_state.iterated))
+        return _Reached(white, state.f_info.residual, state.aux["point"], posterior, result)
+
+    def _evaluate(self, white: Unknowns) -> tuple[dict[str, Any], dict[str, Any], Callable]:
+        point = Point(self.misfit, white)
+        return (
+            point.residuals,
+            {"carried": point.carried, "followed": point.followed, "point": point},
+            point.jacobian,
+        )
 
 
 def _status(state: Any, done: Array) -> FitStatus:
@@ -251,26 +265,7 @@ def _settle(run: _Run, bed: Bed | None, given: Unknowns | None) -> _Reached:
     return reached
 
 
-def _misfit(white: Unknowns, misfit: Misfit):
-    return misfit(white)
-
-
-_observe = eqx.filter_jit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
-
-
-# Compiled not for speed: the state holds a traced Jacobian, which counts as the same only if it is traced once.
-@eqx.filter_jit
-def _begin(solver, white, misfit):
-    structure, aux_structure = eqx.filter_eval_shape(_misfit, white, misfit)
-    return solver.init(_misfit, white, misfit, {}, structure, aux_structure, frozenset())
-
-
-@eqx.filter_jit
-def _step(solver, white, misfit, state):
-    # The auxiliary output that comes back is that of the point before.
-    white, state, _ = solver.step(_misfit, white, misfit, {}, state, frozenset())
-    done, _ = solver.terminate(_misfit, white, misfit, {}, state, frozenset())
-    return white, state, done
+_observe = QuickJit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
 
 
 def _draw(posterior: Posterior, key: PRNGKeyArray):
@@ -302,15 +297,9 @@ def _choose(run: _Run, reached: _Reached, how: Choice, draws: int, key: PRNGKeyA
     return reached
 
 
-def _result(
-    reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: FitProgress
-) -> TractionFit:
+def _result(reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKeyArray, bar: Progress) -> TractionFit:
     misfit = run.misfit
-    palpation, loads = misfit.experiment(reached.white), misfit.tractions(reached.white)
-    solutions = [
-        solve(palpation, jax.tree.map(lambda v, i=i: v[i], loads), misfit.solver, throw=False, progress=False)
-        for i in range(loads.normal.shape[0])
-    ]
+    solutions = [way.solution(misfit.solver) for way in reached.point.ways]
     deviations, moves, whites, dof, iterations, cut_short = [], [], [], [], 0, 0
     for count, one in enumerate(jax.random.split(key, draws)):
         white, normal, move, determined, steps = _draw(reached.posterior, one)
@@ -320,10 +309,10 @@ def _result(
         dof.append(determined)
         iterations += int(steps)
         cut_short += int(steps) >= MOST_ITERATIONS
-        bar.drawn(count + 1, draws)
+        bar.show(f"posterior, draw {count + 1} of {draws}", (count + 1) / draws)
     deviations = jnp.stack(deviations)
-    pressures = _pressure_deviations(palpation, solutions, deviations, jnp.stack(moves))
-    residual = reached.aux["heights"] - misfit.observations.surface
+    pressures = _pressure_deviations(solutions, deviations, jnp.stack(moves))
+    residual = reached.point.heights - misfit.observations.surface
     points, widths = resolution(reached.posterior, misfit)
     numbers = {name: jnp.stack([white.numbers[name] for white in whites]) for name in misfit.parameters}
     solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
@@ -363,20 +352,19 @@ def _result(
 
 
 def _pressure_deviations(
-    palpation: Palpation,
-    solutions: list[Solution],
-    deviations: Float[Array, "draws maps my mx"],
-    moves: Float[Array, "draws maps 3 my mx"],
+    solutions: list[Solution], deviations: Float[Array, "draws maps my mx"], moves: Float[Array, "draws maps 3 my mx"]
 ) -> Float[Array, "draws maps my mx"]:
     """Turn deviations of the normal traction into those of the pressure on the current area [MPa]."""
+    each = [_changes(s, deviations[:, i], moves[:, i]) for i, s in enumerate(solutions)]
+    return jnp.stack(each, axis=1)
 
-    def of_map(i, solution):
-        def one(change, move):
-            return pressure_change(palpation, solution.traction, solution.displacement[:, -1], change, move)
 
-        return jax.vmap(one)(deviations[:, i], moves[:, i])
+@QuickJit
+def _changes(s: Solution, deviations: Float[Array, "draws my mx"], moves: Float[Array, "draws 3 my mx"]) -> Array:
+    def one(change, move):
+        return pressure_change(s.palpation, s.traction, s.displacement[:, -1], change, move)
 
-    return jnp.stack([of_map(i, solution) for i, solution in enumerate(solutions)], axis=1)
+    return jax.vmap(one)(deviations, moves)
 
 
 def _rms(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:

@@ -1,7 +1,6 @@
 """Gauss–Newton steps for optimistix, their linear systems solved by preconditioned conjugate gradients.
 
-Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose. What iterations
-find out of the Gauss–Newton matrix preconditions the next system (BFGS on top of the preconditioner). The curvature of
+What their iterations find out of the Gauss–Newton matrix preconditions the next system. The curvature of
 the residuals, which Gauss–Newton leaves out, is learnt from the steps taken (BFGS on top of the Gauss–Newton matrix):
 where a layer slips and opens, it is several times what Gauss–Newton knows.
 """
@@ -14,6 +13,9 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, PyTree
+
+from ..solvers.compiling import QuickJit
+from .conjugate_gradients import LeastSquares, Secants, dot, is_traced, least_squares, plus
 
 # A point is accepted where the least of the sum of squares along the way lies beyond this part of it; else the next is
 # that least, but between these parts of the last.
@@ -30,164 +32,6 @@ _MEMORY = 20
 _MEMORY_OF_ITERATIONS = 60
 
 
-class LeastSquares(NamedTuple):
-    """Solution of a linear least-squares problem.
-
-    Attributes:
-        x: The solution.
-        rest: What it leaves of b.
-        gradient: Jᵀb.
-        relative_gradient: What is left of the right-hand side, in the preconditioner's norm.
-        iterations: How many it took.
-        secants: What was known of JᵀJ, and what these iterations found.
-    """
-
-    x: PyTree
-    rest: PyTree
-    gradient: PyTree
-    relative_gradient: Array
-    iterations: Array
-    secants: "Secants | None"
-
-
-def least_squares(
-    jacobian: Callable[[PyTree], PyTree],
-    transpose: Callable[[PyTree], PyTree],
-    precondition: Callable[[PyTree], PyTree],
-    b: PyTree,
-    rtol: float | Array,
-    most: int | Array,
-    negligible: float | Array = 0.0,
-    further: Callable[[PyTree], PyTree] | None = None,
-    secants: "Secants | None" = None,
-) -> LeastSquares:
-    """Minimise |J x - b|² / 2 - further(Jᵀb) · x by conjugate gradients on the normal equations.
-
-    Args:
-        jacobian: Multiply with J.
-        transpose: Multiply with its transpose.
-        precondition: Approximate inverse of JᵀJ, symmetric positive; only nearly linear is enough.
-        b: What J x is to match.
-        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + further(Jᵀb), in the preconditioner's norm.
-        most: Most iterations.
-        negligible: Enough is also a gradient of this norm: the length of what is left to go, measured by J.
-        further: What to add to the right-hand side Jᵀb, made from it; None: nothing.
-        secants: What is known of JᵀJ, to correct the preconditioner with; None: nothing, and nothing is learnt.
-
-    Source:
-        Björck, Numerical Methods for Least Squares Problems, algorithm 7.4.1 (CGLS), preconditioned;
-        Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear;
-        Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 for one that learns from the last system.
-    """
-    like = jax.eval_shape(transpose, b)
-    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
-    zero, none = jnp.zeros((), jnp.result_type(*jax.tree.leaves(like))), jnp.zeros((), int)
-
-    def unfinished(carry):
-        *_, size, first, count = carry
-        return (count == 0) | ((size > jnp.maximum(rtol**2 * first, negligible**2)) & (count <= most))
-
-    # The first pass only finds the gradient: so each product appears, and is compiled, once.
-    def iterate(carry):
-        x, rest, pulled, added, before, p, found, size, first, count = carry
-        q = jacobian(p)
-        squared = dot(q, q)
-        step = jnp.where(squared > 0, size / jnp.where(squared > 0, squared, 1.0), 0.0)
-        x, rest = plus(x, p, step), plus(rest, q, -step)
-        now = transpose(rest)
-        pulled = jax.tree.map(lambda new, old: jnp.where(count == 0, new, old), now, pulled)
-        if further is not None:
-            added = jax.lax.cond(count == 0, lambda: further(pulled), lambda: added)
-            now = plus(now, added)
-        if secants is None:
-            z = precondition(now)
-        else:
-            z = secants.corrected(precondition, now)
-            found = found.followed_by(jax.tree.map(lambda v: step * v, p), plus(before, now, -1.0))
-        new = dot(now, z)
-        change = new - dot(before, z)
-        p = plus(z, p, jnp.where(size > 0, change / jnp.where(size > 0, size, 1.0), 0.0))
-        return x, rest, pulled, added, now, p, found, new, jnp.where(count == 0, new, first), count + 1
-
-    start = (zeros, b, zeros, zeros, zeros, zeros, secants, zero, zero, none)
-    x, rest, pulled, *_, found, size, first, count = jax.lax.while_loop(unfinished, iterate, start)
-    return LeastSquares(x, rest, pulled, jnp.sqrt(size / jnp.where(first > 0, first, 1.0)), count - 1, found)
-
-
-def dot(a: PyTree, b: PyTree) -> Array:
-    """Sum the products of all numbers."""
-    return sum((jnp.vdot(v, w) for v, w in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)), start=0.0)
-
-
-def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:
-    """Compute a + factor b."""
-    return jax.tree.map(lambda v, w: v + factor * w, a, b)
-
-
-class Secants(NamedTuple):
-    """Steps taken and what they changed the gradient by, newest last; zero where there is none yet."""
-
-    step: PyTree
-    change: PyTree
-
-    @classmethod
-    def none(cls, like: PyTree, memory: int) -> "Secants":
-        """Remember nothing yet."""
-        zeros = jax.tree.map(lambda v: jnp.zeros((memory, *v.shape), v.dtype), like)
-        return cls(zeros, zeros)
-
-    def followed_by(self, step: PyTree, change: PyTree) -> "Secants":
-        """Remember one more, if the gradient rose along it, and forget the oldest."""
-        rises = dot(step, change) > 0
-
-        def append(stack, new):
-            return jnp.where(rises, jnp.concatenate([stack[1:], new[None]]), stack)
-
-        return Secants(*(jax.tree.map(append, *pair) for pair in zip(self, (step, change), strict=True)))
-
-    def before(self, gradient: PyTree) -> tuple[PyTree, Array]:
-        """Turn a gradient into the right-hand side for the matrix that secants correct; also return what `after` needs.
-
-        Source:
-            Nocedal and Wright, Numerical Optimization, algorithm 7.4 (two-loop recursion).
-        """
-
-        def one(q, secant):
-            along = secant._weight() * dot(secant.step, q)
-            return plus(q, secant.change, -along), along
-
-        return jax.lax.scan(one, gradient, self, reverse=True)
-
-    def after(self, x: PyTree, along: Array) -> PyTree:
-        """Turn the solution with that matrix into the direction."""
-
-        def one(x, each):
-            secant, along = each
-            return plus(x, secant.step, along - secant._weight() * dot(secant.change, x)), None
-
-        return jax.lax.scan(one, x, (self, along))[0]
-
-    def corrected(self, inverse: Callable[[PyTree], PyTree], gradient: PyTree) -> PyTree:
-        """Multiply with an approximate inverse, corrected by what the steps changed."""
-        rest, along = self.before(gradient)
-        return self.after(inverse(rest), along)
-
-    def _weight(self) -> Array:
-        curvature = dot(self.step, self.change)
-        return jnp.where(curvature > 0, 1.0 / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-
-
-class Learnt(eqx.Module):
-    """An approximate inverse, corrected by what iterations have found of the matrix."""
-
-    inverse: Callable[[PyTree], PyTree]
-    secants: Secants
-
-    def __call__(self, gradient: PyTree) -> PyTree:
-        """Multiply with it."""
-        return self.secants.corrected(self.inverse, gradient)
-
-
 class _Direction(eqx.Module):
     newton: Any
     change: Array  # that it makes to the residuals, over their norm
@@ -197,6 +41,30 @@ class _Direction(eqx.Module):
     secants: Secants
     iterated: Secants  # with the Gauss–Newton matrix
     result: optx.RESULTS
+
+
+def _known(y: PyTree, state: _Direction, tries: Array, gradient: PyTree) -> Secants:
+    """Add the last step to what is known of the curvature; nothing is, once it is forgotten."""
+    known = state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
+    return jax.tree.map(lambda v: jnp.where(tries == 0, v, 0.0), known)
+
+
+def _curved(y: PyTree, state: _Direction, tries: Array, gradient: PyTree) -> PyTree:
+    """Compute what the curvature adds to the right-hand side of the linear system."""
+    return plus(_known(y, state, tries, gradient).before(gradient)[0], gradient, -1.0)
+
+
+@QuickJit
+def _direction(
+    y: PyTree, state: _Direction, tries: Array, residual: PyTree, solved: LeastSquares, iterations: Array
+) -> _Direction:
+    """Make the direction from the solution of the linear system."""
+    gradient = solved.gradient
+    known = _known(y, state, tries, gradient)
+    newton = known.after(solved.x, known.before(gradient)[1])
+    change = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
+    iterations = iterations + solved.iterations
+    return _Direction(newton, change, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful)
 
 
 class PreconditionedDescent(optx.AbstractDescent):
@@ -227,7 +95,7 @@ class PreconditionedDescent(optx.AbstractDescent):
     def query(self, y, f_info, state):
         """Solve for the direction at an accepted point."""
         J, residual = f_info.jac, f_info.residual
-        most = jnp.where(f_info.as_min() < self.hopeless, self.most, 0)
+        most = jnp.where(0.5 * dot(residual, residual) < self.hopeless, self.most, 0)
         rtol = jnp.clip(state.change, self.rtol, _ROUGHEST)
         precondition = self.precondition(J)
 
@@ -239,26 +107,18 @@ class PreconditionedDescent(optx.AbstractDescent):
 
         def solve(carry):
             tries, last = carry
-
-            def secants(gradient):
-                known = state.secants.followed_by(plus(y, state.point, -1.0), plus(gradient, state.gradient, -1.0))
-                return jax.tree.map(lambda v: jnp.where(tries == 0, v, 0.0), known)
-
-            def further(gradient):
-                return plus(secants(gradient).before(gradient)[0], gradient, -1.0)
-
+            further = eqx.Partial(_curved, y, state, tries)
             solved = least_squares(
                 J.mv, J.T.mv, precondition, residual, rtol, most, self.negligible, further, last.iterated
             )
-            gradient, known = solved.gradient, secants(solved.gradient)
-            newton = known.after(solved.x, known.before(gradient)[1])
-            change = jnp.sqrt(jnp.maximum(dot(gradient, newton), 0.0) / dot(residual, residual))
-            iterations = last.iterations + solved.iterations
-            return tries + 1, _Direction(
-                newton, change, iterations, y, gradient, known, solved.secants, optx.RESULTS.successful
-            )
+            return tries + 1, _direction(y, state, tries, residual, solved, last.iterations)
 
-        return jax.lax.while_loop(promises_too_much, solve, (jnp.zeros((), int), state))[1]
+        carry = jnp.zeros((), int), state
+        if is_traced((residual, state)):
+            return jax.lax.while_loop(promises_too_much, solve, carry)[1]
+        while promises_too_much(carry):
+            carry = solve(carry)
+        return carry[1]
 
     def step(self, step_size, state):
         """Go a part of the way."""
@@ -301,8 +161,20 @@ class Interpolating(optx.AbstractSearch):
         return length, accept, optx.RESULTS.successful, _Search(length, state.change)
 
 
+class Looking(NamedTuple):
+    """How far Gauss–Newton has come; names as in the state of `optimistix.GaussNewton`."""
+
+    first_step: Array
+    y_eval: PyTree
+    search_state: _Search
+    f_info: Any  # None before the first look
+    aux: Any
+    descent_state: _Direction
+    num_accepted_steps: int
+
+
 class GaussNewton(optx.AbstractGaussNewton):
-    """Gauss–Newton for `optimistix.least_squares`, or for stepping through it.
+    """Gauss–Newton for `optimistix.least_squares`, or driven from the host (`begin`, `look`).
 
     It ends where its next step would change the residuals by less than `rtol` of their norm: in a fit, about what is
     left to go over the posterior's standard deviations, root mean square. Their own change would be the wrong measure:
@@ -321,7 +193,51 @@ class GaussNewton(optx.AbstractGaussNewton):
         state = eqx.tree_at(lambda s: s.search_state.change, state, state.descent_state.change)
         return super().step(fn, y, args, options, state, tags)
 
+    def begin(self, y: PyTree) -> Looking:
+        """Start to look for the least from the host: what `init` does."""
+        return Looking(jnp.asarray(True), y, self.search.init(y, None), None, None, self.descent.init(y, None), 0)
+
+    def look(self, evaluate: Callable, y: PyTree, state: Looking) -> tuple[PyTree, Looking]:
+        """Do what `step` does, from the host: a solve or a product that takes long is then a program by itself.
+
+        Args:
+            evaluate: Computes, at a point, the residuals, what to keep with them, and how to make their Jacobian.
+            y: The point accepted last.
+            state: What came of the last look.
+        """
+        residual, aux, linearise = evaluate(state.y_eval)
+        before = None if state.f_info is None else state.f_info.residual
+        change = state.descent_state.change
+        accept, search_state = _searched(self.search, state.first_step, before, residual, change, state.search_state)
+        f_info, descent_state, accepted = state.f_info, state.descent_state, state.num_accepted_steps
+        if accept:
+            y, f_info, accepted = state.y_eval, optx.FunctionInfo.ResidualJac(residual, linearise()), accepted + 1
+            descent_state = self.descent.query(y, f_info, descent_state)
+        y_eval = _beside(self.descent, y, search_state.step_size, descent_state)
+        aux = aux if accept else state.aux
+        return y, Looking(jnp.asarray(False), y_eval, search_state, f_info, aux, descent_state, accepted)
+
     def terminate(self, fn, y, args, options, state, tags):
         """Tell whether the next step is small."""
         del fn, y, args, options, tags
-        return state.descent_state.change <= self.rtol, optx.RESULTS.successful
+        return self.settled(state), optx.RESULTS.successful
+
+    def settled(self, state: Any) -> Array:
+        """Tell whether the next step is small."""
+        return state.descent_state.change <= self.rtol
+
+
+@QuickJit
+def _searched(
+    search: Interpolating, first_step: Array, before: PyTree, now: PyTree, change: Array, state: _Search
+) -> tuple[Array, _Search]:
+    """Tell whether a point is accepted, and how far to go next."""
+    old, new = (optx.FunctionInfo.Residual(residual) for residual in (before, now))
+    last = eqx.tree_at(lambda s: s.change, state, change)
+    _, accept, _, state = search.step(first_step, None, None, old, new, last)
+    return accept, state
+
+
+@QuickJit
+def _beside(descent: PreconditionedDescent, y: PyTree, step_size: Array, state: _Direction) -> PyTree:
+    return plus(y, descent.step(step_size, state)[0])

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from ..mechanics.face import nodal_area_vector, tributary_area
 from ..model import Palpation, Traction
 from ..solvers import Newton
+from ..solvers.compiling import QuickJit
 from .bed import Bed
 from .data import AxialDisplacement, ForceReading
-from .forward import press
+from .forward import press_exactly
 from .observation import Nodes, Observation, interface_heights
 from .parameters import INDEX, AbstractNumberPrior, with_numbers
 from .posterior import Posterior
@@ -82,6 +83,7 @@ class Misfit(eqx.Module):
         """Keep tractions above zero, where that is asked for."""
         return latent if self.softness is None else self.softness * jax.nn.softplus(latent / self.softness)
 
+    @QuickJit
     def white(self, normal: Float[Array, "maps my mx"]) -> Unknowns:
         """Find unknowns that ask for normal tractions [MPa], the others at their priors' centres."""
         maps, *shape = normal.shape
@@ -111,28 +113,39 @@ class Misfit(eqx.Module):
             return {}
         return {"lateral_informed": 1.0 - jnp.mean(jnp.stack([white.lateral for white in draws]) ** 2)}
 
-    def __call__(self, white: Unknowns, exact: bool = False) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Compute standardised residuals by source, and how the solves went; derivatives as `press` has them."""
-        palpation, numbers = self.experiment(white), self.numbers(white)
-        mesh, spacing = palpation.mesh(), palpation.mesh().spacing
+    def load(self, white: Unknowns, i: int | Array) -> Traction:
+        """Compute the load of one map."""
+        return jax.tree.map(lambda leaf: leaf[i], self.tractions(white))
 
-        def one(each):
-            observation, load = each
-            pressed = press(palpation, load, self.solver, exact)
-            heights = interface_heights(mesh, pressed.u[:, -1]) * numbers.get(INDEX, 1.0)
-            misfit = jnp.where(pressed.reached >= 1.0, observation.misfit(heights), _NOT_CARRIED)
-            return misfit, heights, pressed
+    def __call__(self, white: Unknowns) -> dict[str, Any]:
+        """Compute standardised residuals by source, inside a trace, with exact derivatives."""
+        palpation = self.experiment(white)
+        pressed = [press_exactly(palpation, self.load(white, i), self.solver) for i in range(white.normal.shape[0])]
+        pressed = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pressed)
+        return self.residuals(white, pressed.u, pressed.reached)[0]
 
-        loads = self.tractions(white)
-        misfit, heights, pressed = _one_by_one(one, (self.observations, loads))
-        normal = self.bed.carried(loads.normal, pressed.u[:, 2, -1])
+    def residuals(
+        self, white: Unknowns, u: Float[Array, "maps 3 mz my mx"], reached: Float[Array, " maps"]
+    ) -> tuple[dict[str, Any], Float[Array, "maps my mx"]]:
+        """Compute standardised residuals by source, and heights of the interface [mm].
+
+        Args:
+            white: The unknowns.
+            u: Displacement under each of their loads [mm].
+            reached: Load fraction that it is for [-].
+        """
+        mesh = self.experiment(white).mesh()
+        spacing, index = mesh.spacing, self.numbers(white).get(INDEX, 1.0)
+        heights = jax.vmap(lambda u: interface_heights(mesh, u[:, -1]))(u) * index
+        misfit = jax.vmap(lambda observation, heights: observation.misfit(heights))(self.observations, heights)
+        normal = self.bed.carried(self.tractions(white).normal, u[:, 2, -1])
         # Springs add to what is asked for.
         added = jax.vmap(lambda part: self.prior.whiten(part, spacing))(normal - self.asked(white))
         residuals = {
-            "maps": misfit,
+            "maps": jnp.where(reached[:, None, None] >= 1.0, misfit, _NOT_CARRIED),
             "prior": jax.vmap(lambda part: self.prior.held(part, spacing))(white.normal + added),
             "numbers": white.numbers,
-            "moved": _RIDES_ALONG * pressed.u[:, :, -1],
+            "moved": _RIDES_ALONG * u[:, :, -1],
             "normal": _RIDES_ALONG * normal,
         }
         if self.lateral is not None:
@@ -144,10 +157,9 @@ class Misfit(eqx.Module):
         if self.inside is not None:
             std = self.inside.std
             std = std.reshape(std.shape + (1,) * (4 - std.ndim))
-            off = (pressed.u[:, 2] - self.inside.values) / std
+            off = (u[:, 2] - self.inside.values) / std
             residuals["inside"] = jnp.where(self.inside.mask, 0.0, off)
-        aux = {"carried": pressed.reached >= 1.0, "followed": pressed.followed, "heights": heights}
-        return residuals, aux
+        return residuals, heights
 
 
 def pressure_change(
@@ -206,9 +218,3 @@ def number_covariance(posterior: Posterior) -> Float[Array, "numbers numbers"]:
 
     columns = jnp.stack([column(one) for one in jnp.eye(len(names))])
     return 0.5 * (columns + columns.T)
-
-
-def _one_by_one(function, stacked):
-    if jax.tree.leaves(stacked)[0].shape[0] == 1:
-        return jax.tree.map(lambda v: v[None], function(jax.tree.map(lambda v: v[0], stacked)))
-    return jax.lax.map(function, stacked)

@@ -129,12 +129,12 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
     def spline(values):
         return HeightField(to_y @ values @ to_x.T, jnp.stack([-hx, -hy]), jnp.stack([hx, hy]), "cubic")
 
-    moved, height = (spline(u[0]), spline(u[1])), spline(mesh.thickness + u[2])
+    moved, height = jax.vmap(spline)(u[:2]), spline(mesh.thickness + u[2])
     frozen = jax.lax.stop_gradient(moved)
 
     def newton(at, fields, counts):
         """Say what is left of the way, and the step that Newton's method takes along the axes that count."""
-        values, slope_x, slope_y = (jnp.stack(part) for part in zip(*(field(*at) for field in fields), strict=True))
+        values, slope_x, slope_y = jax.vmap(lambda field: field(*at))(fields)
         off = place - at - values
         counted = jax.lax.stop_gradient(counts(at, off))
         off = jnp.where(counted, off, 0.0)
@@ -155,8 +155,7 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
 
     at = jax.lax.fori_loop(0, 2 * _LOCATING_STEPS, closer, place)
     # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
-    for _ in range(2):
-        at = at + newton(at, moved, found)[1]
+    at = jax.lax.fori_loop(0, 2, lambda _, at: at + newton(at, moved, found)[1], at)
     return height(*at)[0]
 
 

@@ -2,15 +2,16 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._checks import concrete
-from .gauss_newton import LeastSquares, least_squares, plus
+from ..solvers.compiling import QuickJit
+from .conjugate_gradients import LeastSquares, is_traced, least_squares, plus
 
 # Most iterations of each linear system, and the relative gradient that it is solved to.
 MOST_ITERATIONS = 200
@@ -22,13 +23,14 @@ class Posterior(eqx.Module):
 
     Attributes:
         white: The optimum.
-        jacobian: Of all standardised residuals, those of the prior included, by white unknowns.
+        jacobian: Of all standardised residuals, those of the prior included, by white unknowns: a `Jacobian`, or any
+            linear operator of lineax.
         precondition: Approximate inverse of its normal matrix.
         rtol: Relative gradient of the linear system of each draw or product.
     """
 
     white: PyTree
-    jacobian: lx.AbstractLinearOperator
+    jacobian: Any
     precondition: Callable[[PyTree], PyTree]
     rtol: float | Array = _RTOL
 
@@ -45,7 +47,8 @@ class Posterior(eqx.Module):
         """
         if gradient is None:
             gradient = jax.tree.map(jnp.zeros_like, self.white)
-        solved = _solve(self, residual, gradient)
+        traced = is_traced((self, residual, gradient))
+        solved = (QuickJit(_solve) if traced else _solve)(self, residual, gradient)
         iterations = concrete(solved.iterations)
         if iterations is not None and iterations >= MOST_ITERATIONS:
             warnings.warn(
@@ -58,11 +61,11 @@ class Posterior(eqx.Module):
 
     def push(self, change: PyTree) -> PyTree:
         """Multiply a change of the unknowns with the Jacobian."""
-        return _push(self.jacobian, change)
+        return self.jacobian.mv(change)
 
     def pull(self, residuals: PyTree) -> PyTree:
         """Multiply residuals with its transpose."""
-        return _pull(self.jacobian, residuals)
+        return self.jacobian.T.mv(residuals)
 
     def residual_structure(self) -> PyTree:
         """Return shapes and types of the residuals."""
@@ -83,25 +86,33 @@ class Posterior(eqx.Module):
             short. The sum of squares of a part of the residuals, averaged over draws, is the number of degrees of
             freedom that they determine.
         """
-        leaves, tree = jax.tree.flatten(self.residual_structure())
-        keys = jax.random.split(key, len(leaves))
-        noise = jax.tree.unflatten(
-            tree, [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
-        )
+        noise = _noise(self.residual_structure(), key)
         solved = self.solve(noise)
         return solved.x, plus(noise, solved.rest, -1.0), solved.iterations
 
 
-_push = eqx.filter_jit(lambda J, change: J.mv(change))
-_pull = eqx.filter_jit(lambda J, residuals: J.T.mv(residuals))
-
-
-# One compiled program for all that a posterior is asked: products with the Jacobian are large.
-@eqx.filter_jit
 def _solve(posterior: Posterior, residual: PyTree, gradient: PyTree) -> LeastSquares:
-    J = posterior.jacobian
-    precondition, rtol = posterior.precondition, posterior.rtol
-    solved = least_squares(J.mv, J.T.mv, precondition, residual, rtol, MOST_ITERATIONS, further=lambda _: gradient)
+    J, rtol = posterior.jacobian, posterior.rtol
+    further = eqx.Partial(_given, gradient)
+    solved = least_squares(J.mv, J.T.mv, posterior.precondition, residual, rtol, MOST_ITERATIONS, further=further)
+    return _if_solved(solved)
+
+
+def _given(gradient: PyTree, _: PyTree) -> PyTree:
+    return gradient
+
+
+@QuickJit
+def _if_solved(solved: LeastSquares) -> LeastSquares:
     # Products that are not exact enough make the iteration diverge.
     good = solved.relative_gradient <= 1.0
     return jax.tree.map(lambda v: jnp.where(good, v, jnp.nan) if eqx.is_inexact_array(v) else v, solved)
+
+
+@QuickJit
+def _noise(structure: PyTree, key: PRNGKeyArray) -> PyTree:
+    """Draw white noise."""
+    leaves, tree = jax.tree.flatten(structure)
+    keys = jax.random.split(key, len(leaves))
+    each = [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(tree, each)

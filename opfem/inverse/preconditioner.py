@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import Bonded, Palpation
+from ..solvers.compiling import QuickJit
+from .conjugate_gradients import dot, plus
 from .estimates import response
-from .gauss_newton import dot, plus
 from .observation import Nodes, Observation
 from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
 from .transfer import wave_numbers
@@ -103,24 +104,15 @@ class FitNormal(eqx.Module):
             return Preconditioner(self.maps, None, None)
         maps = Preconditioner(self.maps, None, None)
 
-        def direction(one):
-            alone = whole._replace(numbers={name: one[i] for i, name in enumerate(names)})
+        # What change of the tractions a number calls for, and what both do together.
+        def direction(name):
+            alone = whole._replace(numbers={**whole.numbers, name: jnp.ones(())})
+            followed = maps(J.T.mv(J.mv(alone)))
+            z = plus(alone, followed._replace(numbers=whole.numbers), -1.0)
+            return z, J.mv(z)
 
-            # The first pass finds what change of the tractions this number calls for, the second what both do together.
-            def go(carry, _):
-                _, z, _ = carry
-                image = J.mv(z)
-                followed = maps(J.T.mv(image))
-                followed = followed._replace(numbers=jax.tree.map(jnp.zeros_like, followed.numbers))
-                return (z, plus(alone, followed, -1.0), image), None
-
-            nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), J.out_structure())
-            (z, _, image), _ = jax.lax.scan(go, (whole, alone, nothing), length=2)
-            return z, image
-
-        directions, images = jax.lax.map(direction, jnp.eye(len(names)))
-        coarse = jax.vmap(lambda a: jax.vmap(lambda b: dot(a, b))(images))(images)
-        return Preconditioner(self.maps, directions, jnp.linalg.inv(coarse))
+        directions, images = jax.tree.map(lambda *v: jnp.stack(v), *(direction(name) for name in names))
+        return Preconditioner(self.maps, directions, _inverse_gram(images))
 
 
 class Preconditioner(eqx.Module):
@@ -136,6 +128,7 @@ class Preconditioner(eqx.Module):
     directions: Unknowns | None
     coarse: Float[Array, "numbers numbers"] | None
 
+    @QuickJit
     def __call__(self, gradient: Unknowns) -> Unknowns:
         """Multiply with the inverse."""
 
@@ -151,6 +144,12 @@ class Preconditioner(eqx.Module):
         return plus(change._replace(numbers=jax.tree.map(jnp.zeros_like, change.numbers)), fitted)
 
 
+@QuickJit
+def _inverse_gram(images: Any) -> Float[Array, "numbers numbers"]:
+    return jnp.linalg.inv(jax.vmap(lambda a: jax.vmap(lambda b: dot(a, b))(images))(images))
+
+
+@QuickJit
 def fit_normal(palpation: Palpation, observations: Observation, prior: AbstractPrior) -> FitNormal:
     """Build the preconditioner of a fit from its stacked observations."""
     mesh = palpation.mesh()

@@ -55,7 +55,7 @@ def refitted(
     white = _optimum(misfit, posterior, _frozen(start))
     if concrete(misfit.bed.stiffness) == 0.0:  # a dead load: what is asked for is carried, without another solve
         return misfit.asked(white)[0]
-    return carried(misfit(white, exact=True)[0])[0]
+    return carried(misfit(white))[0]
 
 
 def _optimum(misfit: Misfit, posterior: Posterior, start: Unknowns) -> Unknowns:
@@ -81,7 +81,7 @@ def _optimum(misfit: Misfit, posterior: Posterior, start: Unknowns) -> Unknowns:
 
 
 def _gradient(misfit: Misfit, white: Unknowns) -> Unknowns:
-    return jax.grad(lambda w: _half_squares(misfit(w, exact=True)[0]))(white)
+    return jax.grad(lambda w: _half_squares(misfit(w)))(white)
 
 
 def _frozen(tree: Any) -> Any:

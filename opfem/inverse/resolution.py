@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..solvers.compiling import QuickJit
 from .misfit import Misfit, carried
 from .posterior import Posterior
+from .preconditioner import Unknowns
 
 # Points along each axis.
 _GRID = 4
@@ -44,16 +46,24 @@ def resolution(posterior: Posterior, misfit: Misfit) -> tuple[Float[np.ndarray, 
 
 def _image(posterior: Posterior, misfit: Misfit, points: Array) -> Array:
     """Fit the change of the maps that a change of the traction at some nodes makes."""
-    spacing, prior = misfit.palpation.mesh().spacing, misfit.prior
-    slope = jax.jvp(misfit.latent_to_normal, (misfit.latent(posterior.white),), (jnp.ones_like(points),))[1]
-
-    def asked(points):
-        return jax.vmap(lambda part: prior.whiten(part, spacing))(points / slope)
-
-    change = jax.tree.map(jnp.zeros_like, posterior.white)._replace(normal=asked(points))
-    residuals = posterior.push(change)
-    for _ in range(_PASSES):
-        change = change._replace(normal=change.normal + asked(points - carried(residuals)))
+    slope = _slope(posterior.white, misfit)
+    change = jax.tree.map(jnp.zeros_like, posterior.white)
+    carries = jnp.zeros_like(points)
+    for _ in range(_PASSES + 1):
+        change = change._replace(normal=change.normal + _asked(misfit, (points - carries) / slope))
         residuals = posterior.push(change)
+        carries = carried(residuals)
     told = {name: part if name == "maps" else jax.tree.map(jnp.zeros_like, part) for name, part in residuals.items()}
     return carried(posterior.push(posterior.solve(told).x))
+
+
+@QuickJit
+def _slope(white: Unknowns, misfit: Misfit) -> Array:
+    """Compute how much is asked for where the prior's unknown rises by one [-]."""
+    latent = misfit.latent(white)
+    return jax.jvp(misfit.latent_to_normal, (latent,), (jnp.ones_like(latent),))[1]
+
+
+@QuickJit
+def _asked(misfit: Misfit, normal: Array) -> Array:
+    return jax.vmap(lambda part: misfit.prior.whiten(part, misfit.palpation.mesh().spacing))(normal)

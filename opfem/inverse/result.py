@@ -10,8 +10,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..measurement import ThicknessMap
 from ..solvers import Solution
+from ..solvers.compiling import QuickJit
 from .misfit import Misfit, carried, normal_covariance
 from .posterior import Posterior
+from .preconditioner import Unknowns
 from .prior import AbstractPrior
 
 # A direction counts as not observed when the data leave it this part of its standard deviation before.
@@ -214,8 +216,7 @@ class TractionFit(eqx.Module):
             for name, mode in _MODES.items():
                 weights = jnp.zeros(shape).at[i].set(_cosine(shape[1:], mode))
                 after = jnp.sqrt(jnp.sum(weights * normal_covariance(self.posterior, weights)))
-                pulled = jax.vjp(self.misfit.asked, self.posterior.white)[1](weights)[0]
-                before = jnp.sqrt(jnp.sum(pulled.normal**2))
+                before = _std_before(self.misfit, self.posterior.white, weights)
                 label = name if shape[0] == 1 else f"{name} of map {i}"
                 # What the prior does not hold has no standard deviation before the fit.
                 penalised = self.prior.penalised(shape[1:])[mode] == 1.0
@@ -231,6 +232,12 @@ class TractionFit(eqx.Module):
     def _like_normal(self, stacked: Float[Array, "n maps my mx"]) -> Array:
         """Add nothing to draws of several maps; of a single one take the axis of maps away."""
         return stacked if self.residual.ndim == 3 else stacked[:, 0]
+
+
+@QuickJit
+def _std_before(misfit: Misfit, white: Unknowns, weights: Float[Array, "maps my mx"]) -> Array:
+    """Compute the standard deviation [MPa] that a weighted sum of what is asked for has before the fit."""
+    return jnp.sqrt(jnp.sum(jax.vjp(misfit.asked, white)[1](weights)[0].normal ** 2))
 
 
 def _direction_name(names: list[str], direction: np.ndarray) -> str:

@@ -1,19 +1,19 @@
 """Where a fit starts."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.ndimage import zoom
 
+from ..solvers.compiling import QuickJit
 from .estimates import solve_linear
 from .misfit import Misfit
 from .preconditioner import Unknowns
 from .prior import on_nodes
 
 
-@eqx.filter_jit
+@QuickJit
 def from_estimate(misfit: Misfit) -> Unknowns:
     """Start where small-strain elasticity of a flat layer ends."""
     spacing, prior = misfit.palpation.mesh().spacing, misfit.prior

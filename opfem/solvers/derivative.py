@@ -5,19 +5,26 @@ they are gone through again at their recorded displacements, in a scan of fixed 
 displacement is the root of its own balance, so that its derivative costs one linear solve, forward or
 transposed, and friction hands its history on from one to the next.
 
-`follow_path` is for derivatives as users ask for them, of any order. `linearise_path` is for least squares, which
-multiply with one Jacobian many times: it keeps the tangents, and solves no more exactly than that needs.
+`follow_path` is for derivatives as users ask for them, of any order. `linearise`, `push` and `pull` are for least
+squares, which multiply with one Jacobian many times: they keep the tangents, solve no more exactly than that needs,
+and share a compiled program among all solves of all paths.
 """
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array
 
-from .equilibrium import Problem, State
+from ..mechanics.boundary import Bodies
+from .compiling import QuickJit
+from .equilibrium import Forces, Problem, State
 from .newton import Newton, solve_tangent
+from .stencil import Nodal
 from .stepping import Path
 from .tangent import Tangent, Unknowns
 
@@ -42,7 +49,7 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
     settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_CORRECTION_RTOL))
     is_known = length <= path.fraction.shape[0]
 
-    def displaced(slowed: Problem, state: State, solve: Path, _):
+    def solved(slowed: Problem, state: State, solve: Path) -> Unknowns:
         def tangent_solve(matvec, b):
             def solver(transposed):
                 def solved(A, c):
@@ -57,71 +64,200 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
 
         return jax.lax.custom_root(
             lambda x: slowed.balance(x, solve.fraction, state, solve.held), solve.x, lambda _, x: x, tangent_solve
-        ), None
+        )
 
-    return _scan_path(problem, start, (path, None), length, displaced)[0]
-
-
-def linearise_path(problem: Problem, start: State, path: Path, length: Array, settings: Newton) -> tuple[State, State]:
-    """Go through recorded solves again, for `jax.linearize`: first derivatives only, and to 1e-4.
-
-    The tangent and the multigrid of every slot of the path are kept, so that a product with the Jacobian costs
-    little more than its linear solves. For loads only: one correction does not carry what a change of prescribed
-    displacements does to the rest.
-
-    Returns:
-        As `follow_path`.
-    """
-    settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_KEPT_RTOL))
-    is_known = length <= path.fraction.shape[0]
-    frozen, first = jax.lax.stop_gradient((problem, start))
-
-    def tangent_of(slowed: Problem, state: State, solve: Path, _):
-        return solve.x, slowed.tangent(solve.x, solve.fraction, state)
-
-    _, tangents = _scan_path(frozen, first, (path, None), length, tangent_of)
-
-    def displaced(slowed: Problem, state: State, solve: Path, tangent: Tangent):
-        frozen, before = jax.lax.stop_gradient((slowed, state))
-
-        def solver(tangent, transposed):
-            def solved(_, b):
-                change, remaining = _correction(frozen, tangent, transposed, solve.held, b, settings)
-                good = (remaining <= _KEPT_MOST) & is_known
-                return jax.tree.map(lambda v: jnp.where(good, v, jnp.nan), change)
-
-            return solved
-
-        def multiply(change):
-            return jax.jvp(lambda x: frozen.balance(x, solve.fraction, before, solve.held), (solve.x,), (change,))[1]
-
-        # Zero, but for its derivative: that of the unknowns follows by one linear solve.
-        off = slowed.balance(solve.x, solve.fraction, state, solve.held)
-        off = jax.tree.map(lambda r: r - jax.lax.stop_gradient(r), off)
-        change = jax.lax.custom_linear_solve(multiply, off, solver(tangent, False), solver(tangent.transposed(), True))
-        return jax.tree.map(jnp.subtract, solve.x, change), None
-
-    return _scan_path(problem, start, (path, tangents), length, displaced)[0]
-
-
-def _scan_path(problem: Problem, start: State, slots: tuple[Path, Any], length: Array, displaced) -> tuple:
-    """Go through the slots of a path; `displaced` gives each one's unknowns, and what to collect."""
-
-    def one(states, slot):
+    def one(states, solve: Path):
         _, state = states
-        solve, kept = slot
         slowed = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
-        x, collected = displaced(slowed, state, solve, kept)
+        x = solved(slowed, state, solve)
         forces = slowed.forces(x, solve.fraction, state)
-        return (state, slowed.advance(x, solve.fraction, state, solve.held, forces)), collected
+        return state, slowed.advance(x, solve.fraction, state, solve.held, forces)
 
     def step(states, slot):
-        index, slot = slot
-        nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(one, states, slot)[1])
-        return jax.lax.cond(index < length, one, lambda states, _: (states, nothing), states, slot)
+        index, solve = slot
+        return jax.lax.cond(index < length, one, lambda states, _: states, states, solve), None
 
-    indices = jnp.arange(slots[0].fraction.shape[0])
-    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), (start, start), (indices, slots))
+    slots = (jnp.arange(path.fraction.shape[0]), path)
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), (start, start), slots)[0]
+
+
+class Handed(NamedTuple):
+    """What one solve of a path hands on to the next, or a change of it."""
+
+    unknowns: Unknowns
+    histories: Bodies  # of SlipHistory
+
+
+class Solve(NamedTuple):
+    """One solve of a path: the states before and after, and the viscosity of the medium [-]."""
+
+    before: State
+    after: State
+    viscosity: Array
+
+
+class Slot(NamedTuple):
+    """One solve of a path, and the tangent of its balance."""
+
+    solve: Solve
+    tangent: Tangent
+
+
+@QuickJit
+def linearise(problem: Problem, solve: Solve) -> Tangent:
+    """Keep the tangent and the multigrid of one solve, so that a product costs little more than a linear solve."""
+    before, after, viscosity = solve
+    slowed = eqx.tree_at(lambda p: p.viscosity, problem, viscosity)
+    return slowed.tangent(after.unknowns, after.fraction, before)
+
+
+def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed, settings: Newton) -> Handed:
+    """Multiply with the derivative of the path's end, to 1e-4: one linear solve each slot.
+
+    For loads only: one correction does not carry what a change of prescribed displacements does to the rest.
+
+    Args:
+        problem: The problem.
+        slots: The path.
+        moved: Change of the problem; None for what does not change.
+        first: Change of what the first solve is handed.
+        settings: Settings of the solve.
+    """
+
+    def through(change: Handed, slot: Slot) -> Handed:
+        off = _off_balance(problem, slot.solve, moved, change)
+        step = _solve_kept(problem, slot, off, jnp.asarray(False), settings)
+        return _hand_on(problem, slot.solve, moved, change, step)
+
+    return _through(through, first, slots)
+
+
+def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Nodal, settings: Newton) -> Problem:
+    """Multiply weights of the path's last displacement with the transposed derivative by the problem.
+
+    Args:
+        problem: The problem.
+        slots: The path.
+        varies: Which of the problem's numbers vary.
+        weights: Of the displacement.
+        settings: Settings of the solve.
+    """
+
+    def through(carry: tuple[Problem, Handed], slot: Slot) -> tuple[Problem, Handed]:
+        so_far, of_step = _pull_hand_on(problem, slot.solve, *carry)
+        step = _solve_kept(problem, slot, of_step, jnp.asarray(True), settings)
+        return _pull_off_balance(problem, slot.solve, *so_far, step)
+
+    nothing = jax.tree.map(jnp.zeros_like, eqx.filter(problem, varies))
+    if not slots:
+        return nothing
+    after = slots[-1].solve.after
+    last = jax.tree.map(jnp.zeros_like, Handed(after.unknowns, after.histories))
+    last = last._replace(unknowns=last.unknowns._replace(u=weights))
+    return _through(through, (nothing, last), slots, reverse=True)[0]
+
+
+def programs(
+    problem: Problem, solve: Solve, moved: Problem, first: Handed, varies: Problem, settings: Newton
+) -> list[tuple[Callable, tuple]]:
+    """List what `linearise`, `push` and `pull` compile, with arguments of the right shapes, to compile it early."""
+    tangent = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), eqx.filter_eval_shape(linearise, problem, solve))
+    step, yes, varied = solve.after.unknowns, jnp.asarray(True), eqx.filter(problem, varies)
+    return [
+        (linearise, (problem, solve)),
+        (_solve_kept, (problem, Slot(solve, tangent), step, yes, settings)),
+        (_off_balance, (problem, solve, moved, first)),
+        (_hand_on, (problem, solve, moved, first, step)),
+        (_pull_hand_on, (problem, solve, varied, first)),
+        (_pull_off_balance, (problem, solve, varied, first, step)),
+    ]
+
+
+def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: bool = False) -> Any:
+    """Go through slots, each by the one compiled program; where values are traced, by a scan."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((carry, slots))) and slots:
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *slots)
+        return jax.lax.scan(lambda carry, slot: (function(carry, slot), None), carry, stacked, reverse=reverse)[0]
+    for slot in reversed(slots) if reverse else slots:
+        carry = function(carry, slot)
+    return carry
+
+
+class _Equations:
+    """The equations of one solve, as functions of what varies of the problem and of what it was handed."""
+
+    def __init__(self, problem: Problem, solve: Solve, varied: Problem):
+        varies = jax.tree.map(lambda leaf: leaf is not None, varied, is_leaf=lambda leaf: leaf is None)
+        self.problem = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
+        self.solve = solve
+        self.at = eqx.filter(problem, varies), Handed(solve.before.unknowns, solve.before.histories)
+
+    def _start(self, handed: Handed) -> State:
+        u, mean_stress = handed.unknowns
+        return dataclasses.replace(self.solve.before, u=u, mean_stress=mean_stress, histories=handed.histories)
+
+    def balance(self, varied: Problem, handed: Handed) -> Unknowns:
+        """Compute what is out of balance at the state found."""
+        after = self.solve.after
+        problem = eqx.combine(varied, self.problem)
+        return problem.balance(after.unknowns, after.fraction, self._start(handed), after.held)
+
+    def hand_on(self, varied: Problem, handed: Handed, x: Unknowns) -> Handed:
+        """Compute what the next solve is handed."""
+        after = self.solve.after
+        # Only the work takes forces, and nothing takes the work.
+        forces = Forces(jnp.zeros_like(x.u), None, after.applied, None, jnp.ones(()))
+        state = eqx.combine(varied, self.problem).advance(x, after.fraction, self._start(handed), after.held, forces)
+        return Handed(x, state.histories)
+
+
+@QuickJit
+def _off_balance(problem: Problem, solve: Solve, moved: Problem, change: Handed) -> Unknowns:
+    """Compute the change of the balance at the state found, less than nothing: what the next step makes up for."""
+    equations = _Equations(problem, solve, moved)
+    return jax.tree.map(jnp.negative, jax.jvp(equations.balance, equations.at, (moved, change))[1])
+
+
+@QuickJit
+def _hand_on(problem: Problem, solve: Solve, moved: Problem, change: Handed, step: Unknowns) -> Handed:
+    """Compute the change of what the next solve is handed."""
+    equations = _Equations(problem, solve, moved)
+    at = (*equations.at, solve.after.unknowns)
+    return jax.jvp(equations.hand_on, at, (moved, change, step))[1]
+
+
+@QuickJit
+def _pull_hand_on(
+    problem: Problem, solve: Solve, so_far: Problem, weights: Handed
+) -> tuple[tuple[Problem, Handed], Unknowns]:
+    """Multiply with the transpose of `_hand_on`."""
+    equations = _Equations(problem, solve, so_far)
+    pulled = jax.vjp(equations.hand_on, *equations.at, solve.after.unknowns)[1](weights)
+    of_problem, of_handed, of_step = pulled
+    return (jax.tree.map(jnp.add, so_far, of_problem), of_handed), of_step
+
+
+@QuickJit
+def _pull_off_balance(
+    problem: Problem, solve: Solve, so_far: Problem, of_handed: Handed, step: Unknowns
+) -> tuple[Problem, Handed]:
+    """Multiply with the transpose of `_off_balance`."""
+    equations = _Equations(problem, solve, so_far)
+    pulled = jax.vjp(equations.balance, *equations.at)[1](step)
+    return jax.tree.map(jnp.subtract, (so_far, of_handed), pulled)
+
+
+@QuickJit
+def _solve_kept(problem: Problem, slot: Slot, b: Unknowns, transposed: Array, settings: Newton) -> Unknowns:
+    """Solve with a kept tangent or its transpose, by one program; NaN where that fails.
+
+    Both are preconditioned from the left, as the transpose must be (`solve_tangent`).
+    """
+    settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_KEPT_RTOL))
+    tangent = slot.tangent
+    tangent = jax.tree.map(lambda new, old: jnp.where(transposed, new, old), tangent.transposed(), tangent)
+    x, remaining = _correction(problem, tangent, True, slot.solve.after.held, b, settings)
+    return jax.tree.map(lambda v: jnp.where(remaining <= _KEPT_MOST, v, jnp.nan), x)
 
 
 def _solve(

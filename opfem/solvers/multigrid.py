@@ -41,7 +41,7 @@ _SMOOTHING_STEPS = 2
 # Steps that heights take to follow lateral motion.
 _LEANING_STEPS = 4
 # The coarsest grid is solved by one dense inverse of at most about this many unknowns.
-_DENSE_UNKNOWNS = 560
+_DENSE_UNKNOWNS = 300
 
 
 def _chebyshev(steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -215,15 +215,3 @@ def _listen() -> None:
 
 
 _LISTENING: list[bool] = []
-
-
-class FitProgress(Progress):
-    """The former words of a fit."""
-
-    def show(self, step: int, loss: float, inner: int, left: float) -> None:
-        """Say how far a fit is."""
-        super().show(f"step {step}, misfit {loss:.5g}, {inner} inner iterations, {left:.2g} to go")
-
-    def drawn(self, count: int, draws: int) -> None:
-        """Say how far the posterior is."""
-        super().show(f"posterior, draw {count} of {draws}", count / draws)

@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ..model import Load, Palpation
+from .compiling import QuickJit, compiled_meanwhile
 from .derivative import follow_path
 from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
@@ -70,17 +71,19 @@ def solve(
     run = _run_differentiable if traced else _run_with_progress
     with Progress(progress and not traced) as bar:
         bar.stage("solver", compiles=_COMPILES)
-        problem, initial = _prepare(palpation, load, load_start, solver, first, traced)
-        stepping = run(problem, initial, solver, bar)
+        problem, initial = prepare(palpation, load, load_start, solver, first, traced)
+        with compiled_meanwhile([] if traced else [(finish, (problem, initial, palpation, load))]):
+            stepping = run(problem, initial, solver, bar)
         if getattr(load, "correct_approach", False):
             problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, bar)
         bar.stage("fields")
-        solution = _finish(problem, stepping, palpation, load)
+        solution = finish(problem, stepping, palpation, load)
     return _raise_on_failure(solution, traced) if throw else solution
 
 
-@eqx.filter_jit
-def _prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
+@QuickJit
+def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
+    """Discretise a palpation under a load, and begin at a state or at rest."""
     problem = discretise(palpation, load, load_start, solver.face_rule)
     initial = problem.initial_state()
     if state is None:
@@ -96,12 +99,12 @@ def _prepare(palpation, load, load_start, solver, state: State | None, traced: b
     return problem, begin(restarted, solver, traced)
 
 
-_attempt = eqx.filter_jit(attempt)
+compiled_attempt = QuickJit(attempt)
 
 
 def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     while bool(unfinished(stepping)):
-        stepping = _attempt(problem, stepping, solver)
+        stepping = compiled_attempt(problem, stepping, solver)
         fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.viscosity > 0) else ""
         bar.show(f"load {100 * fraction:.0f} %, {int(stepping.newton)} Newton steps{snaps}", fraction)
     return stepping
@@ -139,13 +142,14 @@ def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> t
     return problem, stepping
 
 
-@eqx.filter_jit
+@QuickJit
 def _approach(problem: Problem, s: Stepping, load: Load) -> Array:
     return recover(problem, s.before, s.state, load).stats["approach"]
 
 
-@eqx.filter_jit
-def _finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+@QuickJit
+def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+    """Make the solution from where a solve ended."""
     fields = recover(problem, s.before, s.state, load)
     result = outcome(s)
     ok = s.state.fraction >= 1.0

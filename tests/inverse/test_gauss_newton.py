@@ -8,7 +8,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from opfem.inverse.gauss_newton import GaussNewton, Learnt, PreconditionedDescent, Secants, least_squares
+from opfem.inverse.conjugate_gradients import Learnt, Secants, least_squares
+from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
 
 
 def test_settles_where_residuals_curve_more_than_gauss_newton_knows():

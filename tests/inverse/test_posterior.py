@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.gauss_newton import least_squares
+from opfem.inverse.conjugate_gradients import least_squares
 from opfem.inverse.posterior import Posterior
 from opfem.inverse.transfer import poisson_ratio, transfer_function
 
