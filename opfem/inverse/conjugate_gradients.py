@@ -10,10 +10,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
-from ..solvers.compiling import QuickJit
+from ..solvers.compiling import QuickJit, is_traced
 
 
 class LeastSquares(NamedTuple):
@@ -156,11 +155,6 @@ def _turned(it: _Iteration, gradient: PyTree, precondition: Callable) -> _Iterat
 def _learnt(found: "Secants", it: _Iteration, turned: _Iteration) -> "Secants":
     """Learn of JᵀJ from the last step; in the first pass there was none."""
     return found.followed_by(it.moved, plus(it.before, turned.before, -1.0))
-
-
-def is_traced(tree: PyTree) -> bool:
-    """Tell whether values are those of a trace."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def dot(a: PyTree, b: PyTree) -> Array:

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
-from ..solvers.compiling import QuickJit
-from .conjugate_gradients import LeastSquares, Secants, dot, is_traced, least_squares, plus
+from ..solvers.compiling import QuickJit, is_traced
+from .conjugate_gradients import LeastSquares, Secants, dot, least_squares, plus
 
 # A point is accepted where the least of the sum of squares along the way lies beyond this part of it; else the next is
 # that least, but between these parts of the last.

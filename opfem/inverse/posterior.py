@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._checks import concrete
-from ..solvers.compiling import QuickJit
-from .conjugate_gradients import LeastSquares, is_traced, least_squares, plus
+from ..solvers.compiling import QuickJit, is_traced
+from .conjugate_gradients import LeastSquares, least_squares, plus
 
 # Most iterations of each linear system, and the relative gradient that it is solved to.
 MOST_ITERATIONS = 200

@@ -32,6 +32,12 @@ def _options() -> dict[str, Any]:
     return known
 
 
+def is_traced(tree: Any) -> bool:
+    """Tell whether arrays are traced, or whatever is computed from them here would be."""
+    # Whatever is made inside of a trace is traced.
+    return any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves(tree)))
+
+
 class QuickJit:
     """`equinox.filter_jit`, compiled with less effort; the device is asked for at the first call."""
 
@@ -46,10 +52,7 @@ class QuickJit:
 
     def __call__(self, *args: Any) -> Any:
         """Run it, compiled; as a part of the program where one is traced, whose options are then its own."""
-        # Whatever is made inside of a trace is traced.
-        if any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves(args))):
-            return self._inner(*args)
-        return self._jitted(*args)
+        return self._inner(*args) if is_traced(args) else self._jitted(*args)
 
     @functools.cached_property
     def _inner(self) -> Any:

@@ -1,15 +1,12 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array
 
 from ..model import Load, Palpation
-from .compiling import QuickJit, compiled_meanwhile
+from .compiling import QuickJit, compiled_meanwhile, is_traced
 from .derivative import follow_path
 from .discretise import check_compatible, discretise
 from .equilibrium import Problem, State
@@ -59,7 +56,7 @@ def solve(
     if isinstance(solver, Explicit):
         check_compatible(palpation, load, None if start is None else start.load)
         solution = solve_explicit(palpation, load, solver, start, progress)
-        return _raise_on_failure(solution, _is_traced(solution)) if throw else solution
+        return _raise_on_failure(solution, is_traced(solution)) if throw else solution
     require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
@@ -67,7 +64,7 @@ def solve(
     first = None if start is None else start.last_converged.state
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
-    traced = _is_traced((palpation, load, load_start, first, solver))
+    traced = is_traced((palpation, load, load_start, first, solver))
     run = _run_differentiable if traced else _run_with_progress
     with Progress(progress and not traced) as bar:
         bar.stage("solver", compiles=_COMPILES)
@@ -180,10 +177,6 @@ def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> S
         palpation=palpation,
         load=load,
     )
-
-
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _raise_on_failure(solution: Solution, traced: bool) -> Solution:

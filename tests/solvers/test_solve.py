@@ -126,35 +126,35 @@ def test_failure_returns_status_and_last_state():
 
 
 def test_cut_back_restores_the_state_and_equals_asking_for_the_smaller_increment():
-    from opfem.solvers.solve import _attempt, _prepare
+    from opfem.solvers.solve import compiled_attempt, prepare
 
     settings = op.Newton().as_leaves()
-    problem, start = _prepare(published_palpation(), op.Imprint(bumpy_map()), None, settings, None, False)
-    first = _attempt(problem, start, settings)
+    problem, start = prepare(published_palpation(), op.Imprint(bumpy_map()), None, settings, None, False)
+    first = compiled_attempt(problem, start, settings)
     whole = first._replace(increment=jnp.asarray(0.25, float))
-    failed = _attempt(problem, whole, op.Newton(max_steps=1).as_leaves())
+    failed = compiled_attempt(problem, whole, op.Newton(max_steps=1).as_leaves())
     assert int(failed.increments) == int(first.increments)
     assert int(failed.attempts) == int(first.attempts) + 1
     for kept, before in zip(jax.tree.leaves(failed.state), jax.tree.leaves(first.state), strict=True):
         assert np.array_equal(kept, before)
     assert float(failed.increment) == 0.125
-    after_cut = _attempt(problem, failed, settings)
-    asked = _attempt(problem, first._replace(increment=jnp.asarray(0.125, float)), settings)
+    after_cut = compiled_attempt(problem, failed, settings)
+    asked = compiled_attempt(problem, first._replace(increment=jnp.asarray(0.125, float)), settings)
     np.testing.assert_array_equal(after_cut.state.u, asked.state.u)
     np.testing.assert_array_equal(after_cut.state.histories.window.elastic, asked.state.histories.window.elastic)
 
 
 def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
     """Without friction the path does not count, so the viscous medium must lead to the state of a direct solve."""
-    from opfem.solvers.solve import _attempt, _prepare
+    from opfem.solvers.solve import compiled_attempt, prepare
 
     settings = op.Newton(increments=4).as_leaves()
-    problem, start = _prepare(published_palpation(0.0, 0.0), op.Imprint(bumpy_map()), None, settings, None, False)
-    direct = _attempt(problem, start, settings)
+    problem, start = prepare(published_palpation(0.0, 0.0), op.Imprint(bumpy_map()), None, settings, None, False)
+    direct = compiled_attempt(problem, start, settings)
     snap = start._replace(viscosity=jnp.asarray(1.5, float))
     on_the_way = 0
     while not int(snap.increments):
-        snap = _attempt(problem, snap, settings)
+        snap = compiled_attempt(problem, snap, settings)
         if not int(snap.increments):
             on_the_way += 1
             assert float(snap.state.fraction) == 0.0
