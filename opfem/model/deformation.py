@@ -93,7 +93,7 @@ class ProductSum(eqx.Module):
         legs = tuple((factor, X, transpose(refer(transpose(refer(Y))))) for factor, X, Y in self.legs)
         return ProductSum(both(self.direct), both(self.crossed), legs)
 
-    def block(self, i: int, k: int) -> Tensor:
+    def block(self, i: int | Array, k: int | Array) -> Tensor:
         """Compute A[i, :, k, :] as `(J, L, *points)`."""
         terms = [(f * P[i])[:, None] * Q[k][None] for f, P, Q in self.direct]
         terms += [(f * P[i])[None] * Q[k][:, None] for f, P, Q in self.crossed]
