@@ -125,16 +125,20 @@ def write_results(solution: Solution, measured: ThicknessMap, settings: dict[str
 
 
 def _solver(options: RunOptions) -> Newton | Explicit:
-    own = {"duration": options.duration, "mass_scaling": options.mass_scaling}
-    given = {name: value for name, value in own.items() if value is not None}
+    duration, mass_scaling = options.duration, options.mass_scaling
     if options.solver == "newton":
-        if given or options.checkpoint is not None:
+        if not (duration is None and mass_scaling is None and options.checkpoint is None):
             raise ValueError("--duration, --mass-scaling and --checkpoint need --solver explicit.")
         return Newton() if options.increments is None else Newton(increments=options.increments)
     if options.increments is not None:
         raise ValueError("--increments is for --solver newton; explicit takes as many as are stable.")
-    kept = None if options.checkpoint is None else Checkpoint(options.checkpoint)
-    return Explicit(**given, precision="float32" if options.precision == "float32" else None, checkpoint=kept)
+    published = Explicit()
+    return Explicit(
+        duration=published.duration if duration is None else duration,
+        mass_scaling=published.mass_scaling if mass_scaling is None else mass_scaling,
+        precision="float32" if options.precision == "float32" else None,
+        checkpoint=None if options.checkpoint is None else Checkpoint(options.checkpoint),
+    )
 
 
 def _show_results(solution: Solution, out: Path) -> None:

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
-from ..model import Palpation
+from ..model import Contact, MooneyRivlin, Palpation
 from ..results import summary, to_xarray
 from ..solvers import Newton
 from ..solvers.progress import Progress
@@ -64,8 +64,8 @@ def fit(
             prepare(out)
             show_assumptions(palpation, measured, layer, contact)
             Console(highlight=False).print(
-                f"  prior: pressure {1e3 * float(prior.mean):.3g} ± {1e3 * float(prior.std):.3g} kPa, correlated over "
-                f"{float(prior.length):.3g} mm; noise of the map as given"
+                f"  prior: pressure {1e3 * settings['prior_mean']:.3g} ± {1e3 * settings['prior_std']:.3g} kPa, "
+                f"correlated over {settings['prior_length']:.3g} mm; noise of the map as given"
             )
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", category=UserWarning, module=r"opfem\.")  # shown with the results
@@ -113,9 +113,10 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
     """Summarise a fit in types that JSON knows, every key with its unit.
 
     Args:
-        fitted: A fit of one map.
+        fitted: A fit of one map, with the prior of `state_prior`.
     """
-    stats = fitted.stats
+    stats, prior = fitted.stats, fitted.prior
+    assert isinstance(prior, Matern)
     return {
         **summary(fitted.solution),
         "pressure_std_mean_kPa": 1e3 * float(fitted.pressure_std.mean()),
@@ -128,8 +129,8 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
         "residual_rms_um": 1e3 * float(stats["misfit_rms"]),
         "representation_rms_um": 1e3 * float(stats["representation_rms"]),
         "resolution_um": [1e3 * float(width) for width in fitted.resolution_width],
-        "prior_length_mm": float(fitted.prior.length),
-        "prior_std_kPa": 1e3 * float(fitted.prior.std),
+        "prior_length_mm": float(prior.length),
+        "prior_std_kPa": 1e3 * float(prior.std),
         "fitted_numbers": {name: float(value) for name, value in fitted.numbers.items()},
         "fitted_intervals_95_percent": {name: list(ends) for name, ends in fitted.number_intervals().items()},
         "not_identified_within_25_percent": fitted.not_identified(0.25),
@@ -140,17 +141,17 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
 
 
 def _parameters(palpation: Palpation, asked: FitOptions) -> dict[str, LogNormal]:
-    spreads = {
-        "window.friction": asked.friction_spread,
-        "sample.friction": asked.friction_spread,
-        "layer.material.c10": asked.modulus_spread,
+    window, sample, material = palpation.window, palpation.sample, palpation.layer.material
+    # As `state_experiment` states them.
+    assert isinstance(window, Contact)
+    assert isinstance(sample, Contact)
+    assert isinstance(material, MooneyRivlin)
+    known = {
+        "window.friction": (window.friction, asked.friction_spread),
+        "sample.friction": (sample.friction, asked.friction_spread),
+        "layer.material.c10": (material.c10, asked.modulus_spread),
     }
-    medians = {
-        "window.friction": palpation.window.friction,
-        "sample.friction": palpation.sample.friction,
-        "layer.material.c10": palpation.layer.material.c10,
-    }
-    return {name: LogNormal(medians[name], spread) for name, spread in spreads.items() if spread is not None}
+    return {name: LogNormal(median, spread) for name, (median, spread) in known.items() if spread is not None}
 
 
 def _asked(asked: FitOptions, prior: Matern) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -54,6 +54,7 @@ _UNITS = {
     "mm": {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "m": 1e3},
     "1": {"1": 1.0},
 }
+_Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
@@ -222,9 +223,14 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
     given |= {name: float(column[0]) for name, column in points.columns.items()}
     if "l0" in given:
         given["l0"] = _path(str(given["l0"]), folder)
-    options = [group(**{k: v for k, v in given.items() if k in typing.get_type_hints(group)}) for group in groups]
     path = str(coin_file()) if given["map"] == "coin" else _path(given["map"], folder)
-    return _Inputs(path, *options, increments=given.get("increments"))
+    reading, layer, contact = _group(MapOptions, given), _group(LayerOptions, given), _group(ContactOptions, given)
+    return _Inputs(path, reading, layer, contact, given.get("increments"))
+
+
+def _group(kind: type[_Options], given: Mapping[str, Any]) -> _Options:
+    """Make a group of options of those given that belong to it."""
+    return kind(**{name: value for name, value in given.items() if name in typing.get_type_hints(kind)})
 
 
 def _path(name: str, folder: Path) -> str:

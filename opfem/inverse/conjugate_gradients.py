@@ -4,6 +4,8 @@ Nothing is materialised: one iteration multiplies once with the Jacobian and onc
 find out of the normal matrix corrects the preconditioner of the next system (BFGS on top of it).
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -159,7 +161,8 @@ def _learnt(found: "Secants", it: _Iteration, turned: _Iteration) -> "Secants":
 
 def dot(a: PyTree, b: PyTree) -> Array:
     """Sum the products of all numbers."""
-    return sum((jnp.vdot(v, w) for v, w in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)), start=0.0)
+    products = (jnp.vdot(v, w) for v, w in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return functools.reduce(operator.add, products)
 
 
 def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:

@@ -201,7 +201,7 @@ class _Run:
             jnp.asarray(_CG_NEGLIGIBLE),
             jnp.asarray(misfit.hopeless),
         )
-        gauss_newton = GaussNewton(jnp.asarray(self.rtol), jnp.asarray(self.rtol), descent)
+        gauss_newton = GaussNewton(rtol=jnp.asarray(self.rtol), atol=jnp.asarray(self.rtol), descent=descent)
         state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):

@@ -123,5 +123,6 @@ def press_exactly(palpation: Palpation, load: Traction, solver: Newton) -> Press
         return unfinished(s) & (s.length <= settings.max_path)
 
     end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
+    assert end.path is not None
     _, state = follow_path(problem, start.state, end.path, end.kept, settings)
     return Pressed(state.u, end.state.fraction)

@@ -59,6 +59,7 @@ def _direction(
     y: PyTree, state: _Direction, tries: Array, residual: PyTree, solved: LeastSquares, iterations: Array
 ) -> _Direction:
     """Make the direction from the solution of the linear system."""
+    assert solved.secants is not None
     gradient = solved.gradient
     known = _known(y, state, tries, gradient)
     newton = known.after(solved.x, known.before(gradient)[1])

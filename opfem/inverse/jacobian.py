@@ -40,7 +40,7 @@ class Point:
     def __init__(self, misfit: Misfit, white: Unknowns):
         """Solve under the loads that unknowns stand for."""
         solver, maps = misfit.solver, jnp.arange(white.normal.shape[0])
-        self.ways = [press(*_experiment(misfit, white, i), solver) for i in maps]
+        self.ways = [press(*_experiment(misfit, white, i), solver=solver) for i in maps]
         self._at = _At(
             misfit,
             white,
@@ -127,7 +127,7 @@ class Transposed(eqx.Module):
         return self.jacobian.transposed_mv(weights)
 
 
-def programs(misfit: Misfit, white: Unknowns) -> list[tuple[Callable, tuple]]:
+def programs(misfit: Misfit, white: Unknowns) -> list[tuple[QuickJit, tuple]]:
     """List what a fit compiles, the longest first, with arguments of the right shapes, to compile it early."""
     i, maps = jnp.arange(1)[0], white.normal.shape[0]
     palpation, load = _experiment(misfit, white, i)

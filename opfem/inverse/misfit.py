@@ -111,7 +111,8 @@ class Misfit(eqx.Module):
         """Tell how much of the variance of a fitted lateral traction the maps took away, from draws of deviations."""
         if self.lateral is None:
             return {}
-        return {"lateral_informed": 1.0 - jnp.mean(jnp.stack([white.lateral for white in draws]) ** 2)}
+        drawn = jnp.stack([white.lateral for white in draws if white.lateral is not None])
+        return {"lateral_informed": 1.0 - jnp.mean(drawn**2)}
 
     def load(self, white: Unknowns, i: int | Array) -> Traction:
         """Compute the load of one map."""

@@ -48,7 +48,7 @@ class Unknowns(NamedTuple):
 def indentation(gain: Nodes, softness: Nodes, normal: Nodes) -> Nodes:
     """Compute the small-strain indentation [mm] under a normal traction [MPa], of a layer as thick as it is locally."""
     parts = [np.r_[0.5, np.ones(n - 2), 0.5] for n in normal.shape]
-    return softness * from_cosines(gain * cosine_transform(np.outer(*parts) * normal))
+    return softness * from_cosines(gain * cosine_transform(normal * np.outer(*parts)))
 
 
 class LayerNormal(eqx.Module):
@@ -137,7 +137,7 @@ class Preconditioner(eqx.Module):
 
         maps = self.maps
         change = gradient._replace(normal=jax.vmap(one)(maps.gain, maps.softness, maps.precision, gradient.normal))
-        if self.directions is None:
+        if self.directions is None or self.coarse is None:
             return change
         along = self.coarse @ jax.vmap(lambda z: dot(z, gradient))(self.directions)
         fitted = jax.tree.map(lambda z: jnp.tensordot(along, z, 1), self.directions)

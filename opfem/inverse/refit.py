@@ -1,5 +1,7 @@
 """The fitted traction as a differentiable function of what it was fitted to."""
 
+import functools
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -89,7 +91,7 @@ def _frozen(tree: Any) -> Any:
 
 
 def _half_squares(residuals: Any) -> Array:
-    return 0.5 * sum(jnp.sum(part**2) for part in jax.tree.leaves(residuals))
+    return 0.5 * functools.reduce(operator.add, (jnp.sum(part**2) for part in jax.tree.leaves(residuals)))
 
 
 def _size(tree: Any) -> Array:

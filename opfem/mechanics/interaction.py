@@ -43,7 +43,7 @@ class SlipHistory(eqx.Module):
     position: Float[Array, "2 points *faces"]
     elastic: Float[Array, "2 points *faces"]
     slip: Float[Array, "2 points *faces"]
-    dissipated: Float[Array, "*bodies"] | None
+    dissipated: Float[Array, "*bodies"]
     pressure: Float[Array, "points *faces"]
 
 
@@ -70,17 +70,14 @@ def joined_histories(histories: Sequence[SlipHistory]) -> SlipHistory:
     """Put the histories of several faces side by side."""
     if len(histories) == 1:
         return histories[0]
-    dissipated = jnp.stack([history.dissipated for history in histories])
-    joined = join([dataclasses.replace(history, dissipated=None) for history in histories])
-    return dataclasses.replace(joined, dissipated=dissipated)
+    return join([dataclasses.replace(history, dissipated=history.dissipated[None]) for history in histories])
 
 
 def separate_histories(history: SlipHistory, count: int) -> list[SlipHistory]:
     """Undo `joined_histories`."""
     if count == 1:
         return [history]
-    parts = split(dataclasses.replace(history, dissipated=None), count)
-    return [dataclasses.replace(part, dissipated=history.dissipated[k]) for k, part in enumerate(parts)]
+    return [dataclasses.replace(part, dissipated=part.dissipated[0]) for part in split(history, count)]
 
 
 class TangentLaw(NamedTuple):
@@ -257,6 +254,12 @@ class ContactFace(eqx.Module):
     sides: Bool[Array, " *faces"] | None = None
     shares: Float[Array, "points *faces"] | None = None
 
+    @property
+    def own_contact(self) -> Contact:
+        """Law and friction of faces that are not paired."""
+        assert isinstance(self.contact, Contact)
+        return self.contact
+
     def initial_history(self, x: Corners) -> SlipHistory:
         """Build the history of a face that has not slipped."""
         position = surface_tangents(x, self.rule)[0][:2]
@@ -301,7 +304,7 @@ class ContactFace(eqx.Module):
         return np.repeat(side, points.shape[-1] // side.size) if side.ndim else side
 
     def _clearance(self, points: FacePoints) -> Float[Array, "points *faces"]:
-        towards = self._side(points.height) * (points.height - points.position[2])
+        towards = (points.height - points.position[2]) * self._side(points.height)
         offset = (
             jnp.repeat(self.offset, points.height.shape[-1] // self.offset.size) if self.offset.ndim else self.offset
         )
@@ -380,7 +383,7 @@ class ContactFace(eqx.Module):
 
     def _clearance_slope(self, points: FacePoints, clearance: Array, curvature: Array | float) -> PointVector:
         """Compute the derivative of the clearance by the points' positions [-], with a share of the curvature."""
-        return -self._side(clearance) * points.normal - clearance / points.stretch * _stretch_slope(points, curvature)
+        return points.normal * -self._side(clearance) - clearance / points.stretch * _stretch_slope(points, curvature)
 
     def _friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "_Friction":
         trial, (slope_x, slope_y) = _trial(points, history), points.slope
@@ -532,13 +535,13 @@ def paired(faces: Sequence[ContactFace]) -> ContactFace:
         return None if values[0] is None else jnp.concatenate(values, axis=-1)
 
     return ContactFace(
-        contact=PairedContact(tuple(face.contact for face in faces)),
+        contact=PairedContact(tuple(face.own_contact for face in faces)),
         surface=PairedSurface(tuple(face.surface for face in faces)),
         offset=jnp.stack([face.offset for face in faces]),
         imposed=None,
         element_size=first.element_size,
         stiffness=first.stiffness,
-        above=tuple(face.above for face in faces),
+        above=tuple(bool(face.above) for face in faces),
         rule=first.rule,
         sides=side_by_side([face.sides for face in faces]),
         shares=side_by_side([face.shares for face in faces]),

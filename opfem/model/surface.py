@@ -4,6 +4,9 @@ The grid has the spacing of the layer's mesh and reaches past the layer, so that
 stays confined as it spreads; outside, the surface continues at its edge value.
 """
 
+import functools
+import operator
+from collections.abc import Iterable
 from typing import Literal
 
 import equinox as eqx
@@ -48,8 +51,8 @@ class HeightField(eqx.Module):
         along_x = self._weights(x, i, 0, order)
         along_y = self._weights(y, j, 1, order)
         values = self._around(i, j)
-        rows = sum(along_x[:, None, n] * values[None, :, n] for n in range(4))  # order along x, row, points
-        return sum(along_y[:, m, None] * rows[None, :, m] for m in range(4))
+        rows = _total(along_x[:, None, n] * values[None, :, n] for n in range(4))  # order along x, row, points
+        return _total(along_y[:, m, None] * rows[None, :, m] for m in range(4))
 
     def around(self, x: Array, y: Array) -> "Patches":
         """Collect what the surface is made of around points [mm], to evaluate it there again and again."""
@@ -151,6 +154,10 @@ def _spline_prefilter(n: int) -> np.ndarray:
     rows[0, 0] += 1
     rows[-1, -1] += 1
     return np.linalg.inv(rows / 6)
+
+
+def _total(parts: Iterable[Array]) -> Array:
+    return functools.reduce(operator.add, parts)
 
 
 def _horner(c, t: Array) -> Array:

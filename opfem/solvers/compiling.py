@@ -48,7 +48,8 @@ class QuickJit:
 
     @functools.cached_property
     def _jitted(self) -> Any:
-        return eqx.filter_jit(self._function, compiler_options=_options())
+        # It hands options on to `jax.jit`, which its declared overloads leave out.
+        return eqx.filter_jit(self._function, compiler_options=_options())  # pyright: ignore[reportCallIssue]
 
     def __call__(self, *args: Any) -> Any:
         """Run it, compiled; as a part of the program where one is traced, whose options are then its own."""

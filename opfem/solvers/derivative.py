@@ -159,7 +159,7 @@ def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Noda
 
 def programs(
     problem: Problem, solve: Solve, moved: Problem, first: Handed, varies: Problem, settings: Newton
-) -> list[tuple[Callable, tuple]]:
+) -> list[tuple[QuickJit, tuple]]:
     """List what `linearise`, `push` and `pull` compile, with arguments of the right shapes, to compile it early."""
     tangent = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), eqx.filter_eval_shape(linearise, problem, solve))
     step, yes, varied = solve.after.unknowns, jnp.asarray(True), eqx.filter(problem, varies)

@@ -106,7 +106,7 @@ class Forces(NamedTuple):
 class Touch(NamedTuple):
     """Contact faces that are evaluated as one, and which bodies they belong to."""
 
-    names: tuple[Body, ...]
+    names: tuple[str, ...]
     face: ContactFace
 
     def history(self, histories: Bodies) -> SlipHistory:

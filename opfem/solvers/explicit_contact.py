@@ -81,7 +81,7 @@ def still(face: ContactFace, x: FaceVector) -> FaceMotion:
     """Start a face that nothing touches yet."""
     zero = jnp.zeros_like(x)
     # The law is open there, so the first pressure equation starts from where the node would be.
-    clearance = jnp.full_like(x[0], 1.0) * face.contact.law.zero_pressure_clearance
+    clearance = jnp.full_like(x[0], 1.0) * face.own_contact.law.zero_pressure_clearance
     return FaceMotion(clearance, zero, zero, zero[:2], zero[0], Work(*zero))
 
 
@@ -128,7 +128,7 @@ def touch(
     along = jnp.stack([d[0], d[1], slope_x * d[0] + slope_y * d[1]])
     squared = jnp.sum(along**2, axis=0)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    limit = face.contact.friction * push * mobility  # as a displacement
+    limit = face.own_contact.friction * push * mobility  # as a displacement
     share = jnp.where(squared > 0, jnp.minimum(limit / length, 1.0), 0.0)
     added = added - share * along
     normal_force = jnp.zeros_like(move) if face.imposed is not None else -side * push * normal
@@ -161,7 +161,7 @@ def _push(face: ContactFace, guess: Face, free: Face, mobility: Face, area: Face
     The right side falls and the left side rises, so there is one root. What is left after the last step is linear in
     all but the clearance it starts from, so that the derivative is that of the root.
     """
-    law = face.contact.law
+    law = face.own_contact.law
     if isinstance(law, HardOverclosure):
         return free, jnp.maximum(-free, 0.0) / mobility
     give = mobility * area

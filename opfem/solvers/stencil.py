@@ -6,7 +6,8 @@ neighbour at offset (dz - 1, dy - 1, dx - 1).
 """
 
 import itertools
-from functools import partial
+import operator
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -68,14 +69,14 @@ def apply_stencil(S: PartStencil, u: PartNodal) -> PartNodal:
         partial(_sum_over_neighbours, shape=shape), S.reshape(27, -1, nodes), jnp.tile(padded, (components, 1))
     )
     pairs = pairs.reshape(components, components, *shape)
-    return sum((pairs[:, j] for j in range(1, components)), start=pairs[:, 0])
+    return reduce(operator.add, (pairs[:, j] for j in range(components)))
 
 
 def _sum_over_neighbours(blocks: Array, padded: Array, shape: tuple[int, ...]) -> Array:
     along_z, along_y, nodes = shape[1] * shape[2], shape[2], int(np.prod(shape))
     shifts = [dz * along_z + dy * along_y + dx for dz, dy, dx in itertools.product(range(3), repeat=3)]
     products = [blocks[k] * padded[:, shift : shift + nodes] for k, shift in enumerate(shifts)]
-    return sum(products[1:], start=products[0])
+    return reduce(operator.add, products)
 
 
 def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
