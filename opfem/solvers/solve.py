@@ -97,6 +97,7 @@ def prepare(palpation, load, load_start, solver, state: State | None, traced: bo
 
 
 compiled_attempt = QuickJit(attempt)
+_compiled_follow_path = QuickJit(follow_path)
 
 
 def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
@@ -109,9 +110,12 @@ def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar
 
 def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     frozen, start, settings = jax.lax.stop_gradient((problem, stepping, solver))
-    end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
+    if is_traced((frozen, start, settings)):
+        end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
+    else:  # differentiated, but not part of a larger program
+        end = _run_with_progress(frozen, start, settings, bar)
     assert end.path is not None
-    before, state = follow_path(problem, stepping.state, end.path, end.kept, settings)
+    before, state = _compiled_follow_path(problem, stepping.state, end.path, end.kept, settings)
     return end._replace(before=before, state=state, path=None)
 
 
