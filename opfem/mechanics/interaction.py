@@ -5,7 +5,6 @@ Friction is Coulomb's with elastic slip and a return map; the slip of a point is
 the surface, in the surface's own (x, y), and its history is carried from increment to increment.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,216 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..model import Contact, HeightField
-from ..model.surface import Patches
+from ..model import Contact
+from .contact_body import ImposedPressure, RigidSurface
+from .contact_state import ContactIterate, Corners, FacePoints, PointContact, PointVector, SlipHistory, TangentLaw
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
-from .paired_contact import PairedContact, PairedSurface, join, split
+from .paired_contact import PairedContact, PairedSurface
 from .staging import apart
 
 # Share of the largest elastic slip from which a point counts as slipping.
 _AT_LIMIT = 0.9
-
-Corners = Float[Array, "4 3 *faces"]  # nodal values at the corners of every face
-PointVector = Float[Array, "3 points *faces"]
-
-
-class SlipHistory(eqx.Module):
-    """What friction remembers at the end of an increment, per face point.
-
-    Attributes:
-        position: (x, y) of the points `(2, points, *faces)` [mm].
-        elastic: Elastic part of the slip `(2, points, *faces)` [mm].
-        slip: Slip slid so far, along x and y `(2, points, *faces)` [mm].
-        dissipated: Work done by friction so far on the whole face [N mm]; of each body where faces are paired.
-        pressure: Contact pressure at the points [MPa], where the next increment starts from.
-    """
-
-    position: Float[Array, "2 points *faces"]
-    elastic: Float[Array, "2 points *faces"]
-    slip: Float[Array, "2 points *faces"]
-    dissipated: Float[Array, "*bodies"]
-    pressure: Float[Array, "points *faces"]
-
-
-class ContactIterate(NamedTuple):
-    """What a Newton iteration remembers of a face besides displacement.
-
-    Attributes:
-        pressure: Contact pressure at the points [MPa], an unknown of its own.
-        direction: Slip that a sliding point had in the last step `(2, points, *faces)` [mm], zero
-            where it stuck.
-        change: What the step found, but not yet taken, changes the pressure by [MPa].
-    """
-
-    pressure: Float[Array, "points *faces"]
-    direction: Float[Array, "2 points *faces"]
-    change: Float[Array, "points *faces"]
-
-    def after(self, length: Array) -> "ContactIterate":
-        """Take a step of a length from 0 to 1."""
-        return self._replace(pressure=jnp.maximum(self.pressure + length * self.change, 0.0))
-
-
-def joined_histories(histories: Sequence[SlipHistory]) -> SlipHistory:
-    """Put the histories of several faces side by side."""
-    if len(histories) == 1:
-        return histories[0]
-    return join([dataclasses.replace(history, dissipated=history.dissipated[None]) for history in histories])
-
-
-def separate_histories(history: SlipHistory, count: int) -> list[SlipHistory]:
-    """Undo `joined_histories`."""
-    if count == 1:
-        return [history]
-    return [dataclasses.replace(part, dissipated=part.dissipated[0]) for part in split(history, count)]
-
-
-class TangentLaw(NamedTuple):
-    """Contact linearised for one Newton step: p = pressure + slope (g - clearance).
-
-    Newton's method on displacement and pressure together, with the pressure eliminated. The
-    pressure follows the linearised clearance, so that the curvature of a surface that a point
-    slides along does not throw it off: what makes stiff laws converge in few full steps.
-    A sliding point whose slip reverses sticks for one step: a sliding point has no stiffness
-    along its slip, so that without this it would jump back and forth for ever.
-    """
-
-    pressure: Float[Array, "points *faces"]
-    clearance: Float[Array, "points *faces"] | None
-    slope: Float[Array, "points *faces"]
-    sticks: Array
-    curvature: Array | float = 1.0
-
-    def __call__(self, clearance: Array) -> Array:
-        """Evaluate the pressure [MPa]; a closed point may pull for one step."""
-        if self.clearance is None:
-            return self.pressure + self.slope * (clearance - jax.lax.stop_gradient(clearance))
-        return self.pressure + self.slope * (clearance - self.clearance)
-
-    def at_its_pressure(self) -> "TangentLaw":
-        """Keep the slope, but give `pressure` itself: for the geometric part of the tangent."""
-        return self._replace(clearance=None)
-
-
-class FacePoints(NamedTuple):
-    """Where the points of faces are, and the rigid surface at their x and y.
-
-    Attributes:
-        fraction: Load fraction [-].
-        position: Of the points [mm].
-        tangents: dx/dξ and dx/dη there `(2, 3, points, *faces)` [mm].
-        height: Of the surface [mm].
-        slope: Of the surface along x and y `(2, points, *faces)` [-].
-        bend: Second derivatives of the surface `(2, 2, points, *faces)` [1/mm]; None where only forces are asked for.
-    """
-
-    fraction: Array
-    position: PointVector
-    tangents: Float[Array, "2 3 points *faces"]
-    height: Float[Array, "points *faces"]
-    slope: Float[Array, "2 points *faces"]
-    bend: Float[Array, "2 2 points *faces"] | None
-
-    @property
-    def stretch(self) -> Float[Array, "points *faces"]:
-        """Area of the surface over that of its projection on the plane z = 0 [-]."""
-        return jnp.sqrt(1.0 + self.slope[0] ** 2 + self.slope[1] ** 2)
-
-    @property
-    def normal(self) -> PointVector:
-        """Normal of the surface, upward."""
-        return jnp.concatenate([-self.slope, jnp.ones_like(self.slope[:1])]) / self.stretch
-
-
-class PointContact(NamedTuple):
-    """Contact at face points: tractions per current area [MPa], and the history after it."""
-
-    traction: PointVector  # on the layer, pressure and friction
-    pressure: Float[Array, "points *faces"]
-    clearance: Float[Array, "points *faces"]
-    elastic: Float[Array, "2 points *faces"]
-    slid: Float[Array, "2 points *faces"]
-    friction: Float[Array, "2 points *faces"]  # conjugate to slip in the surface's (x, y)
-    sliding: Array
-    slips: Array  # friction at its limit, or just below after an increment that only settles
-
-
-class RigidSurface(eqx.Module):
-    """A rigid body's surface: a height field that moves from `start` to `end` along z.
-
-    None for both is the plane z = 0.
-    """
-
-    start: HeightField | None
-    end: HeightField | None
-
-    @property
-    def is_plane(self) -> bool:
-        """Whether it is the plane z = 0."""
-        return self.end is None
-
-    def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Evaluate height [mm] and slopes [-] when a fraction of the motion is done."""
-        d = self.derivatives(fraction, x, y, 1)
-        return d[0, 0], d[0, 1], d[1, 0]
-
-    def derivatives(self, fraction: Array, x: Array, y: Array, order: int) -> Float[Array, "along_y along_x *points"]:
-        """Evaluate height [mm] and its derivatives (`HeightField.derivatives`)."""
-        if self.start is None or self.end is None:
-            return jnp.zeros((order + 1, order + 1, *x.shape), x.dtype)
-        low, high = self.start.coefficients, self.end.coefficients
-        now = eqx.tree_at(lambda f: f.coefficients, self.end, (1.0 - fraction) * low + fraction * high)
-        return now.derivatives(x, y, order)
-
-    def around(self, x: Array, y: Array) -> "RigidPatches | None":
-        """Collect what the surface is made of around points [mm]; None for the plane z = 0."""
-        if self.start is None or self.end is None:
-            return None
-        return RigidPatches(self.start.around(x, y), self.end.around(x, y))
-
-
-class RigidPatches(eqx.Module):
-    """A rigid surface around points, at the start and at the end of its motion."""
-
-    start: Patches
-    end: Patches
-
-    def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Evaluate height [mm], slopes [-] and rise per load fraction [mm]."""
-        low, high = self.start.powers, self.end.powers
-        height, slope_x, slope_y = eqx.tree_at(lambda p: p.powers, self.end, low + fraction * (high - low))(x, y)
-        return height, slope_x, slope_y, eqx.tree_at(lambda p: p.powers, self.end, high - low).height(x, y)
-
-
-class ImposedPressure(eqx.Module):
-    """A pressure per reference area that bounds friction: a dead one, applied elsewhere, and a bed of springs.
-
-    Attributes:
-        start: Dead pressure at the corners of the faces at load fraction 0 `(4, *faces)` [MPa].
-        end: The same at load fraction 1.
-        area: Reference area per unit of (ξ, η) at the points [mm²].
-        height: Of the points where the springs are at rest [mm]; None: there are no springs.
-        stiffness: Of the springs at load fractions 0 and 1 [MPa/mm].
-    """
-
-    start: Float[Array, "4 *faces"]
-    end: Float[Array, "4 *faces"]
-    area: Float[Array, "points *faces"]
-    height: Float[Array, "points *faces"] | None = None
-    stiffness: tuple[Array, Array] | None = None
-
-    def springs(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
-        """Compute the springs' pressure [MPa] at heights [mm]; negative where they pull."""
-        if self.height is None or self.stiffness is None:
-            return jnp.zeros_like(z)
-        start, end = self.stiffness
-        return ((1.0 - fraction) * start + fraction * end) * (z - self.height)
-
-    def bounding(self, fraction: Array, rule: FaceRule, springs: Array | float) -> Float[Array, "points *faces"]:
-        """Compute the pressure [MPa] at the points with that of the springs; tension bounds friction by zero."""
-        corners = (1.0 - fraction) * self.start + fraction * self.end
-        return jnp.maximum(contract(quadrature(rule).N, corners) + springs, 0.0)
 
 
 class ContactFace(eqx.Module):

@@ -8,8 +8,9 @@ from jaxtyping import Array, ArrayLike
 
 from .._checks import concrete
 from ..mechanics.boundary import Bodies, is_side, take
+from ..mechanics.contact_body import ImposedPressure, RigidSurface
 from ..mechanics.face import FaceRule, area_vector, gather_face, node_shares, size, surface_tangents, tributary_area
-from ..mechanics.interaction import ContactFace, ImposedPressure, RigidSurface
+from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import ELEMENT_FORMS, layer_body
 from ..model import (
     Bonded,
@@ -25,7 +26,8 @@ from ..model import (
     Traction,
     height_field,
 )
-from .equilibrium import Problem, Supports, drift_modes
+from .equilibrium import Problem
+from .supports import Supports, drift_modes
 from .tangent import VOLUME_GUARD
 
 

@@ -14,56 +14,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, put, take, to_touching, touched
-from ..mechanics.face import tributary_area
-from ..mechanics.interaction import (
-    ContactFace,
+from ..mechanics.contact_state import (
     ContactIterate,
     FacePoints,
     SlipHistory,
     TangentLaw,
-    can_pair,
     joined_histories,
-    paired,
     separate_histories,
 )
+from ..mechanics.interaction import ContactFace, can_pair, paired
 from ..mechanics.internal import LayerBody
 from ..mechanics.paired_contact import split
-from ..model.palpation import SIDES
 from .multigrid import build_multigrid
 from .stencil import Nodal
+from .supports import Supports
 from .tangent import Tangent, Unknowns, couple_volume
-
-
-class Supports(NamedTuple):
-    """Which displacements are prescribed: static, so that it shapes the compiled solve."""
-
-    window: str  # "contact", "roller" or "bonded"
-    interface: str  # "contact", "traction", "uz" or "bonded"
-    sides: tuple[str, str, str, str]
-    spring: bool  # an in-plane spring holds the window face
-
-    def free(self, node_shape: tuple[int, ...]) -> np.ndarray:
-        """Build the mask of unknowns, 1 where free, `(3, nz+1, ny+1, nx+1)`."""
-        free = np.ones((3, *node_shape))
-        for side, kind in zip(SIDES, self.sides, strict=True):
-            if kind == "roller":
-                component, where = ("x", "y").index(side[0]), 0 if side[1] == "0" else -1
-                free[(component, ..., where) if component == 0 else (component, slice(None), where)] = 0.0
-        for kind, layer in ((self.window, 0), (self.interface, -1)):
-            if kind in ("roller", "uz"):
-                free[2, layer] = 0.0
-            if kind == "bonded":
-                free[:, layer] = 0.0
-        return free
-
-    @property
-    def drifts(self) -> tuple[bool, bool, bool]:
-        """Rigid in-plane motions that only friction resists: along x, along y, about z."""
-        if self.spring or "bonded" in (self.window, self.interface):
-            return (False, False, False)
-        x = "roller" not in self.sides[:2]
-        y = "roller" not in self.sides[2:]
-        return (x, y, x and y)
 
 
 class State(eqx.Module):
@@ -433,25 +398,6 @@ class Problem(eqx.Module):
         nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._corners(u, body), self.elements))
         applied = Bodies(*(touching or Touching(u[:, 0], None) for touching in nothing))
         return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
-
-
-def drift_modes(positions: Nodal, supports: Supports) -> Float[Array, "modes 2 my mx"] | None:
-    """Build orthonormal rigid motions of the window face that no support prevents; None without any.
-
-    Weighted by area: what they measure is the mean in-plane motion of the face.
-    """
-    X = positions[:2, 0]
-    area = tributary_area(positions[:, 0])
-    centred = X - jnp.sum(area * X, axis=(1, 2), keepdims=True) / jnp.sum(area)
-    zero = jnp.zeros_like(area)
-    candidates = (jnp.stack([area, zero]), jnp.stack([zero, area]), area * jnp.stack([-centred[1], centred[0]]))
-    modes: list[Array] = []
-    for drifts, mode in zip(supports.drifts, candidates, strict=True):
-        if drifts:
-            for other in modes:
-                mode = mode - jnp.sum(mode * other) * other
-            modes.append(mode / jnp.sqrt(jnp.sum(mode**2)))
-    return jnp.stack(modes) if modes else None
 
 
 # Every corner's share of its element, as an element matrix.

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import check_positive
+from ..mechanics.contact_state import ContactIterate, FacePoints
 from ..mechanics.face import FaceRule
-from ..mechanics.interaction import ContactIterate, FacePoints
 from .equilibrium import Forces, Problem, State
 from .krylov import KrylovResult, fgmres
 from .stencil import Nodal
