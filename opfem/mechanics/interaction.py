@@ -6,7 +6,7 @@ the surface, in the surface's own (x, y), and its history is carried from increm
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,11 +15,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..model import Contact
+from .boundary import Bodies
 from .contact_body import ImposedPressure, RigidSurface
-from .contact_state import ContactIterate, Corners, FacePoints, PointContact, PointVector, SlipHistory, TangentLaw
+from .contact_state import (
+    ContactIterate,
+    Corners,
+    FacePoints,
+    PointContact,
+    PointVector,
+    SlipHistory,
+    TangentLaw,
+    joined_histories,
+)
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
-from .paired_contact import PairedContact, PairedSurface
+from .paired_contact import PairedContact, PairedSurface, split
 from .staging import apart
 
 # Share of the largest elastic slip from which a point counts as slipping.
@@ -322,6 +332,21 @@ def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
     assert points.bend is not None
     along = points.slope[0] * points.bend[0] + points.slope[1] * points.bend[1]
     return jnp.concatenate([curvature * along / points.stretch, jnp.zeros_like(along[:1])])
+
+
+class Touch(NamedTuple):
+    """Contact faces that are evaluated as one, and which bodies they belong to."""
+
+    names: tuple[str, ...]
+    face: ContactFace
+
+    def history(self, histories: Bodies) -> SlipHistory:
+        """Put the friction histories of the bodies side by side."""
+        return joined_histories([getattr(histories, name) for name in self.names])
+
+    def split(self, values: Any) -> dict[str, Any]:
+        """Split values of all faces into those of each body."""
+        return dict(zip(self.names, split(values, len(self.names)), strict=True))
 
 
 def paired(faces: Sequence[ContactFace]) -> ContactFace:

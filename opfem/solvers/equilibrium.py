@@ -17,14 +17,11 @@ from ..mechanics.boundary import Bodies, Body, Corners, Touching, add_matrices, 
 from ..mechanics.contact_state import (
     ContactIterate,
     FacePoints,
-    SlipHistory,
     TangentLaw,
-    joined_histories,
     separate_histories,
 )
-from ..mechanics.interaction import ContactFace, can_pair, paired
+from ..mechanics.interaction import Touch, can_pair, paired
 from ..mechanics.internal import LayerBody
-from ..mechanics.paired_contact import split
 from .multigrid import build_multigrid
 from .stencil import Nodal
 from .supports import Supports
@@ -68,21 +65,6 @@ class Forces(NamedTuple):
     smallest_J: Array
 
 
-class Touch(NamedTuple):
-    """Contact faces that are evaluated as one, and which bodies they belong to."""
-
-    names: tuple[str, ...]
-    face: ContactFace
-
-    def history(self, histories: Bodies) -> SlipHistory:
-        """Put the friction histories of the bodies side by side."""
-        return joined_histories([getattr(histories, name) for name in self.names])
-
-    def split(self, values: Any) -> dict[str, Any]:
-        """Split values of all faces into those of each body."""
-        return dict(zip(self.names, split(values, len(self.names)), strict=True))
-
-
 class Problem(eqx.Module):
     """A palpation and its load, discretised."""
 
@@ -122,7 +104,7 @@ class Problem(eqx.Module):
         return Forces(internal, volume, Bodies(), spring, smallest_J)
 
     @property
-    def faces(self) -> tuple["Touch", ...]:
+    def faces(self) -> tuple[Touch, ...]:
         """The contacts, of window and sample together where they can be evaluated as one."""
         there = [(name, face) for name, face in zip(Bodies._fields, self.contacts, strict=True) if face is not None]
         groups = [there] if can_pair([face for _, face in there]) else [[one] for one in there]
@@ -154,7 +136,7 @@ class Problem(eqx.Module):
         nothing = (None,) * len(self.faces)
         return zip(self.faces, *(values or nothing for values in of_faces), strict=True)
 
-    def _take(self, values: Nodal, touch: "Touch") -> Corners:
+    def _take(self, values: Nodal, touch: Touch) -> Corners:
         sides = touch.face.sides is not None
         return jnp.concatenate([take(values, name, with_sides=sides) for name in touch.names], axis=-1)
 
