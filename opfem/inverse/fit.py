@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -48,6 +49,10 @@ _PRESSED = 1e-4
 _LEAST_PART = 5e-3
 # A non-negative pressure bends towards zero below this part of the shear modulus.
 _SOFTNESS = 0.05
+# Draws of the posterior at a time: a draw waits for the host between programs of milliseconds. On 20×20×2 elements and
+# two busy cores a fit takes 40 s instead of 54.
+_DRAWS_AT_ONCE = 2
+# What compiles, for the progress line.
 _COMPILES = "the programs of a fit, about a minute the first time"
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
 _MOST_CHOICES = 8
@@ -301,15 +306,17 @@ def _result(reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKe
     misfit = run.misfit
     solutions = [way.solution(misfit.solver) for way in reached.point.ways]
     deviations, moves, whites, dof, iterations, cut_short = [], [], [], [], 0, 0
-    for count, one in enumerate(jax.random.split(key, draws)):
-        white, normal, move, determined, steps = _draw(reached.posterior, one)
-        deviations.append(normal)
-        moves.append(move)
-        whites.append(white)
-        dof.append(determined)
-        iterations += int(steps)
-        cut_short += int(steps) >= MOST_ITERATIONS
-        bar.show(f"posterior, draw {count + 1} of {draws}", (count + 1) / draws)
+    keys = jax.random.split(key, draws)
+    with ThreadPoolExecutor(max_workers=_DRAWS_AT_ONCE) as pool:
+        drawn = pool.map(lambda one: _draw(reached.posterior, one), keys)
+        for count, (white, normal, move, determined, steps) in enumerate(drawn):
+            deviations.append(normal)
+            moves.append(move)
+            whites.append(white)
+            dof.append(determined)
+            iterations += int(steps)
+            cut_short += int(steps) >= MOST_ITERATIONS
+            bar.show(f"posterior, draw {count + 1} of {draws}", (count + 1) / draws)
     deviations = jnp.stack(deviations)
     pressures = _pressure_deviations(solutions, deviations, jnp.stack(moves))
     residual = reached.point.heights - misfit.observations.surface
