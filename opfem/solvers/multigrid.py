@@ -40,8 +40,9 @@ _SMOOTHED = (0.5, 4.0)
 _SMOOTHING_STEPS = 2
 # Steps that heights take to follow lateral motion.
 _LEANING_STEPS = 4
-# The coarsest grid is solved by one dense inverse of at most about this many unknowns. On the coin, 40×40×4 elements, 540
-# would save a grid, 740 of 13 800 instructions to compile, and cost 12 % of run time: the inverse, and 4 steps of 78 more.
+# The coarsest grid is solved by one dense inverse of at most about this many unknowns. 540 would save the coin on
+# 40×40×4 elements a grid, 700 of 13 800 instructions to compile, and cost 12 % of run time: the inverse, and 4 steps
+# of 78 more.
 _DENSE_UNKNOWNS = 450
 
 
