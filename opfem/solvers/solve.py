@@ -18,7 +18,7 @@ from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_fai
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
 # Compiling takes as long whatever the mesh.
-_COMPILES = "the solver, about 20 s the first time"
+_COMPILES = "the solver, about 10 s the first time"
 
 
 def solve(
