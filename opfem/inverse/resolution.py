@@ -59,7 +59,7 @@ def _image(posterior: Posterior, misfit: Misfit, points: Array) -> Array:
 
 @QuickJit
 def _slope(white: Unknowns, misfit: Misfit) -> Array:
-    """Compute how much is asked for where the prior's unknown rises by one [-]."""
+    """Compute the derivative of the normal traction by the latent field [-]: 1 unless it is kept non-negative."""
     latent = misfit.latent(white)
     return jax.jvp(misfit.latent_to_normal, (latent,), (jnp.ones_like(latent),))[1]
 

@@ -236,7 +236,7 @@ class TractionFit(eqx.Module):
 
 @QuickJit
 def _std_before(misfit: Misfit, white: Unknowns, weights: Float[Array, "maps my mx"]) -> Array:
-    """Compute the standard deviation [MPa] that a weighted sum of what is asked for has before the fit."""
+    """Compute the prior standard deviation [MPa] of a weighted sum of the normal traction."""
     return jnp.sqrt(jnp.sum(jax.vjp(misfit.asked, white)[1](weights)[0].normal ** 2))
 
 

@@ -76,7 +76,7 @@ class ContactFace(eqx.Module):
         return SlipHistory(position, zero, zero, jnp.zeros((), position.dtype), zero[0])
 
     def locate(self, fraction: Array, x: Corners, bends: bool = False) -> FacePoints:
-        """Find the points of faces with corners x [mm], and the surface there, with its second derivatives if asked."""
+        """Locate the points of faces with corners x [mm]; evaluate the surface there, with `bends` to second order."""
         position, *tangents = surface_tangents(x, self.rule)
         order = 2 if bends else 1
 

@@ -39,7 +39,7 @@ def is_traced(tree: Any) -> bool:
 
 
 class QuickJit:
-    """`equinox.filter_jit`, compiled with less effort; the device is asked for at the first call."""
+    """`equinox.filter_jit` at a low XLA optimisation level; options follow the default device at the first call."""
 
     def __init__(self, function: Callable):
         functools.update_wrapper(self, function)

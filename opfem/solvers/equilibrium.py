@@ -111,7 +111,7 @@ class Problem(eqx.Module):
         return tuple(Touch(tuple(name for name, _ in group), paired([face for _, face in group])) for group in groups)
 
     def locate(self, u: Nodal, fraction: Array, bends: bool = False) -> tuple[FacePoints, ...]:
-        """Find the points of `faces`, with the surfaces' second derivatives if asked."""
+        """Locate the quadrature points of `faces`; evaluate the surfaces there, `bends` to second order."""
         x = self.positions + u
         return tuple(touch.face.locate(fraction, self._take(x, touch), bends) for touch in self.faces)
 
