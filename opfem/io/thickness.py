@@ -13,11 +13,9 @@ import numpy as np
 
 from ..measurement import MeasurementError, Step, ThicknessMap
 from ..measurement.checks import THICKEST, THINNEST, doubtful_unit
+from ..measurement.grid import LENGTH_UNITS as UNITS
 from .array_files import Entry, guarded, read_arrays
 from .atomic import whole_file
-
-UNITS = {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "m": 1e3}  # both code points of µ
-"""Size of each accepted unit of thickness [mm]."""
 
 _FORMAT = "opfem thickness map 1"
 

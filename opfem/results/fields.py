@@ -6,7 +6,7 @@ Part of `to_xarray` and `summary`; plain arrays on the host.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..measurement.interpolation import bilinear
+from ..measurement.grid import bilinear
 
 # Each step reduces the error by the lateral displacement gradient, about 0.3 on a sharp map.
 _MOST_STEPS = 60
