@@ -29,13 +29,31 @@ from .inverse import (
 from .io import (
     Checkpoint as Checkpoint,
     read_netcdf as read_netcdf,
+    read_oct as read_oct,
+    read_spectra as read_spectra,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
+    write_oct as write_oct,
     write_pvd as write_pvd,
     write_thickness as write_thickness,
     write_vtu as write_vtu,
 )
 from .measurement import MeasurementError as MeasurementError, ThicknessMap as ThicknessMap
+from .measurement.oct import (
+    EDGES as EDGES,
+    LAYER as LAYER,
+    SAMPLE as SAMPLE,
+    SCATTERING_LAYER as SCATTERING_LAYER,
+    UWA_845NM as UWA_845NM,
+    Interface as Interface,
+    Medium as Medium,
+    OctSystem as OctSystem,
+    OctVolume as OctVolume,
+    Spectra as Spectra,
+    find_interface as find_interface,
+    simulate_oct as simulate_oct,
+    thickness_from_oct as thickness_from_oct,
+)
 from .model import (
     Bonded as Bonded,
     Contact as Contact,

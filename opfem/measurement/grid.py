@@ -3,6 +3,7 @@
 `ThicknessMap` and OCT volumes are both sampled on one, in x along image columns and y along image rows.
 """
 
+import abc
 from typing import Any
 
 import equinox as eqx
@@ -22,14 +23,17 @@ class AbstractGrid(eqx.Module):
     """Something sampled at points of a regular grid in x and y.
 
     Attributes:
-        shape: Number of samples (ny, nx).
         spacing: Distance between samples (dx, dy) [mm].
         origin: (x, y) of the first sample [mm].
     """
 
-    shape: eqx.AbstractVar[tuple[int, ...]]
     spacing: eqx.AbstractVar[Any]
     origin: eqx.AbstractVar[Pair]
+
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Number of samples (ny, nx), and more where there are more axes."""
 
     @property
     def x(self) -> Float[Array, " nx"]:
