@@ -56,8 +56,8 @@ def find_lines(power: Float[np.ndarray, "rows columns nz"], fwhm: float) -> Dept
     profiles = np.stack([np.median(quarter, axis=(0, 1)) for quarter in quarters])
     bases = grey_opening(profiles, size=(1, max(3, round(_WIDTH * fwhm))), mode="nearest")
     excess = np.min(profiles - _ABOVE * bases, axis=0)
-    runs, count = label(excess > 0)
-    for run in range(1, count + 1):
+    runs = np.asarray(label(excess > 0)[0])  # pyright: ignore[reportIndexIssue]
+    for run in range(1, runs.max() + 1):
         inside = binary_dilation(runs == run, iterations=max(1, round(fwhm)))
         tops = np.argmax(np.where(inside, profiles, 0.0), axis=1)
         if np.ptp(tops) > _SPREAD * fwhm:
