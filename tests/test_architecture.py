@@ -23,12 +23,12 @@ MAY_IMPORT |= {
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},
     "datasets": {"datasets", "io", "measurement"},
-    "sweep": {"sweep", "io", "compilation", *CHAIN},
+    "sweeps": {"sweeps", "io", "compilation", *CHAIN},
 }
-SEE_ALL = {"__init__", "cli"}
+SEE_ALL = {"__init__", "__main__", "cli"}
 
 LIBRARY_HOMES = {
-    "xarray": {"results", "io", "sweep", "plot", "cli"},
+    "xarray": {"results", "io", "sweeps", "plot", "cli"},
     "h5py": {"io"},
     "scipy.io": {"io"},
     "pyvista": {"io", "plot"},

@@ -4,14 +4,26 @@ import dataclasses
 import math
 from typing import Any
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from .._types import ScalarLike
+from ..compilation import cache_compilation, silence_alarm
 from ..io import read_thickness
 from ..measurement import EXAMPLE_LAYER, ThicknessMap, example_map
-from ..model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
+from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
 from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
+
+
+def configure_jax(no_cache: bool) -> None:
+    """Compute in float64, and keep compiled programs for the commands to come."""
+    jax.config.update("jax_enable_x64", True)
+    if no_cache:
+        silence_alarm()
+    else:
+        cache_compilation()
 
 
 def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | ThicknessMap]:
@@ -55,8 +67,8 @@ def state_experiment(
     reading: MapOptions,
     layer: LayerOptions,
     contact: ContactOptions,
-) -> tuple[Palpation, Imprint]:
-    """State the experiment and its load; the maps are filled and smoothed here.
+) -> tuple[Palpation, ThicknessMap]:
+    """State the experiment, and the loaded thickness without missing pixels; the maps are filled and smoothed here.
 
     Args:
         measured: Loaded thickness as measured.
@@ -75,7 +87,21 @@ def state_experiment(
         fwhm = 0.5 * min(length / max(count, 1) for length, count in zip(extent, layer.elements[:2], strict=True))
     if isinstance(unloaded, ThicknessMap):
         unloaded = _ready(unloaded, fwhm)
-    palpation = Palpation(
+    return state_palpation(unloaded, extent, layer, contact), _ready(measured, fwhm)
+
+
+def state_palpation(
+    unloaded: ScalarLike | ThicknessMap, extent: tuple[float, float], layer: LayerOptions, contact: ContactOptions
+) -> Palpation:
+    """State the experiment, which checks its numbers.
+
+    Args:
+        unloaded: Unloaded thickness [mm].
+        extent: Of the layer [mm].
+        layer: Material, mesh and sides.
+        contact: Contact with window and sample.
+    """
+    return Palpation(
         Layer(unloaded, _material(layer)),
         extent=extent,
         elements=layer.elements,
@@ -84,7 +110,6 @@ def state_experiment(
         sides=layer.sides,
         element=layer.element,
     )
-    return palpation, Imprint(_ready(measured, fwhm), correct_approach=contact.correct_approach)
 
 
 def show_assumptions(
@@ -163,7 +188,7 @@ def _material(options: LayerOptions) -> MooneyRivlin:
 
 
 def settings_of(
-    path: str, reading: MapOptions, layer: LayerOptions, contact: ContactOptions, load: Imprint
+    path: str, reading: MapOptions, layer: LayerOptions, contact: ContactOptions, thickness: ThicknessMap
 ) -> dict[str, Any]:
     """Collect what was asked for and what was assumed, for summary.json."""
     given = {name: value for part in (reading, layer, contact) for name, value in dataclasses.asdict(part).items()}
@@ -171,7 +196,7 @@ def settings_of(
     used: dict[str, Any] = {name: float(getattr(material, name)) for name in ("c10", "c01", "bulk")}
     if math.isinf(used["bulk"]):
         used["bulk"] = "inf"  # JSON has no infinite number; --bulk reads this
-    used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(load.thickness)[-1]
+    used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(thickness)[-1]
     assumed = [name for name in used if given[name] is None]
     stated = {name: value for name, value in given.items() if value is not None}
     return {"map": path, **stated, **used, "assumed": assumed}
