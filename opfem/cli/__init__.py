@@ -33,8 +33,10 @@ def main(tokens: Sequence[str] | None = None) -> None:
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader of the output has gone, as `head` does; what Python flushes at the very end must not raise again.
+    except OSError as cause:
+        if not isinstance(cause, BrokenPipeError):  # the reader has gone, as `head` does
+            os.write(2, f"opfem: cannot write the output: {cause.strerror}.\n".encode())
+        # What Python flushes at the very end must not raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         raise SystemExit(1) from None
     except SystemExit as end:

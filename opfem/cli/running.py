@@ -7,7 +7,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -112,18 +111,21 @@ def _ended_in_time() -> Iterator[None]:
     """End the process where a Ctrl-C has not done so in time: Python hears of it only between its own instructions."""
     heard, bell = socket.socketpair()
     bell.setblocking(False)
+    ended = threading.Event()
     former = signal.set_wakeup_fd(bell.fileno(), warn_on_full_buffer=False)
 
     def watch() -> None:
-        while signal.SIGINT not in (number := heard.recv(1)):
-            if not number:
-                return
-        time.sleep(_GRACE)
-        leave()
+        with heard:
+            while signal.SIGINT not in (number := heard.recv(1)):
+                if not number:
+                    return
+        if not ended.wait(_GRACE):
+            leave()
 
     threading.Thread(target=watch, name="opfem Ctrl-C", daemon=True).start()
     try:
         yield
     finally:
+        ended.set()
         signal.set_wakeup_fd(former)
         bell.close()

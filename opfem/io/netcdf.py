@@ -4,6 +4,8 @@ Edge of the chain: what `to_xarray` labelled is stored with all its attributes, 
 """
 
 import os
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import xarray as xr
@@ -37,8 +39,11 @@ def netcdf_bytes(dataset: xr.Dataset) -> memoryview:
     """
     numeric = [name for name, values in dataset.variables.items() if values.ndim and values.dtype.kind in "fiub"]
     encoding = dict.fromkeys(numeric, _COMPRESSION)
-    # What another file stored by is not how this one is to be stored.
-    content = dataset.drop_encoding().to_netcdf(engine="h5netcdf", encoding=encoding)
+    # With a client of dask at work xarray would ask it for a lock named by the buffer, and fail.
+    dask = sys.modules.get("dask")
+    with nullcontext() if dask is None else dask.config.set(scheduler="synchronous"):
+        # What another file stored by is not how this one is to be stored.
+        content = dataset.drop_encoding().to_netcdf(engine="h5netcdf", encoding=encoding)
     assert isinstance(content, memoryview)
     return content
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import opfem as op
 from opfem import cli
@@ -94,6 +95,38 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys):
         ('map = "map.npy"', "", "needs [inputs] with map = ..."),
         ('keep = ["max_pressure", "pressure", "force_sample"]', 'keep = "all"', "keep must be a list of names"),
         ("[outputs]", "[outputs", "is not TOML"),
+        ("points = 2,", 'points = 2, log = "false",', "[axes] c10 log must be true or false, got 'false'"),
+        ("points = 2,", "points = 2, log = 0,", "[axes] c10 log must be true or false, got 0"),
+        ("points = 2,", "points = 2.0,", "[axes] c10 points must be a whole number, got 2.0"),
+        ("points = 2,", "points = true,", "[axes] c10 points must be a whole number, got True"),
+        ("points = 2,", "points = -1,", "[axes] c10 points must be a whole number of at least 1, got -1"),
+        ("from = 2.0", 'from = "2.0"', "[axes] c10 [MPa] must be a number, got '2.0'"),
+        ('unit = "kPa"', "unit = 3", "[axes] c10 unit must be one of MPa, kPa, Pa, got 3"),
+        ('unit = "kPa"', 'unit = ["kPa"]', "[axes] c10 unit must be one of MPa, kPa, Pa, got ['kPa']"),
+        ("[0.0, 0.2]", "[0.0, true]", "[axes] window_friction [1] must be a number, got True"),
+        ("[0.0, 0.2]", "[0.0, nan]", "[axes] window_friction [1] must be zero or positive, got [0.0, nan]"),
+        ("[0.0, 0.2]", "{ values = 0.2 }", "[axes] window_friction must hold a list of numbers, got 0.2"),
+        ("smooth = 0.2", 'smooth = "0.2"', "[inputs] smooth must be a number, got '0.2'"),
+        ("smooth = 0.2", "smooth = true", "[inputs] smooth must be a number, got True"),
+        ("smooth = 0.2", "smooth = -0.2", "[inputs] smooth [mm] must be zero or a positive number, got -0.2"),
+        ("smooth = 0.2", 'correct_approach = "false"', "[inputs] correct_approach must be true or false, got 'false'"),
+        ("smooth = 0.2", "correct_approach = 1", "[inputs] correct_approach must be true or false, got 1"),
+        ("smooth = 0.2", "variable = 3", "[inputs] variable must be text, got 3"),
+        ("smooth = 0.2", "increments = 4.0", "[inputs] increments must be a whole number, got 4.0"),
+        ("smooth = 0.2", 'unit = "inch"', "[inputs] unit must be one of mm, um, µm, m, got 'inch'"),
+        ("l0 = 0.5", "l0 = true", "[inputs] l0 must be text, got True"),
+        ("l0 = 0.5", "l0 = -0.5", "[inputs] l0 [mm] must be a positive number, or the path of a map, got -0.5"),
+        ("l0 = 0.5", 'l0 = "0,5"', "the path of a map, got '0,5': there is no such file"),
+        ('map = "map.npy"', "map = 3", "[inputs] map must be text, got 3"),
+        ('map = "map.npy"', 'map = "none.npy"', "none.npy: no such file"),
+        ('["max_pressure", "pressure", "force_sample"]', '["max_presure"]', "Did you mean 'max_pressure'?"),
+        ('["max_pressure", "pressure", "force_sample"]', "[1]", "[outputs] keep must be a list of names, got [1]"),
+        ('"force_sample"]', '"pressure"]', "[outputs] keep must name each output once"),
+        ("[outputs]", '[design]\nkind = "grid"\npoints = 4\n[outputs]', "[design] points is for kind sobol"),
+        ("[outputs]", '[design]\nkind = ["zip"]\n[outputs]', "[design] kind must be one of grid"),
+        ("[outputs]", '[execution]\nsize = "3"\n[outputs]', "[execution] size must be a whole number, got '3'"),
+        ("[outputs]", "[execution]\nsize = 0\n[outputs]", "[execution] size must be a whole number of at least 1"),
+        ("[outputs]", "[execution]\nthreads = true\n[outputs]", "[execution] threads must be a whole number, got True"),
         ("[outputs]", "[design]\nkind = 'sobol'\n[outputs]", "points must be a whole number of at least 1"),
         ("[outputs]", "[execution]\nmode = 'pmap'\n[outputs]", "[execution] mode must be one of"),
     ],
@@ -104,6 +137,115 @@ def test_what_is_wrong_with_a_file(config, tmp_path, capsys, old, new, message):
     assert opfem("sweep", config, "--out", tmp_path / "out") == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def computed(monkeypatch):
+    """The sweep computes nothing, and leaves a folder as a real one does."""
+
+    def compute(function, points, *, keep, execution, out):
+        (out / "points").mkdir(parents=True)
+        for name in ("points/a.npz", "sweep.json", "result.nc"):
+            (out / name).write_text(str(len(points)))
+        return xr.Dataset({"status": ("point", ["successful"] * len(points))})
+
+    monkeypatch.setattr("opfem.cli.sweep.compute", compute)
+
+
+def contents(folder) -> dict[str, str]:
+    """Read every file of a folder, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+OLD = {"points/old.npz": "kept", "sweep.json": "{}", "result.nc": "kept"}
+
+
+@pytest.fixture
+def finished(tmp_path):
+    out = tmp_path / "out"
+    (out / "points").mkdir(parents=True)
+    for name, text in OLD.items():
+        (out / name).write_text(text)
+    return out
+
+
+class TestForce:
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ('map = "map.npy"', 'map = "no_such_map.npy"'),
+            ("[outputs]", "[outputs"),
+            ("window_friction", "window_frction"),
+            ('"force_sample"]', '"force_smple"]'),
+            ("[0.0, 0.2]", "[-0.1, 0.2]"),
+            ("extent = [2.0, 2.0]", "extent = [2.0, -2.0]"),
+            ("bulk = 0.11732", ""),
+            ("elements = [6, 6, 2]", 'elements = [6, 6, 3]\nelement = "tet10"'),
+            ("bulk = 0.11732", "bulk = inf"),
+            ("[outputs]", '[design]\nkind = "zip"\npoints = 3\n[outputs]'),
+            ("[outputs]", "[execution]\nsize = -1\n[outputs]"),
+        ],
+    )
+    def test_everything_is_checked_before_the_old_sweep_is_touched(self, config, finished, computed, old, new):
+        assert old in CONFIG
+        config.write_text(CONFIG.replace(old, new), encoding="utf-8")
+        assert opfem("sweep", config, "--out", finished, "--force") == 1
+        assert contents(finished) == OLD
+
+    def test_the_new_sweep_takes_the_place_of_the_old_one(self, config, finished, computed):
+        (finished / "notes.txt").write_text("mine")
+        assert opfem("sweep", config, "--out", finished, "--force") == 0
+        new = {"points/a.npz": "4", "sweep.json": "4", "result.nc": "4"}
+        assert contents(finished) == {**new, "notes.txt": "mine"}
+
+    def test_the_old_sweep_stays_until_the_new_one_is_complete(self, config, finished, monkeypatch, capsys):
+        def begin(function, points, *, keep, execution, out):
+            (out / "points").mkdir(parents=True, exist_ok=True)
+            for name in ("points/a.npz", "sweep.json"):
+                (out / name).write_text("begun")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("opfem.cli.sweep.compute", begin)
+        assert opfem("sweep", config, "--out", finished, "--force") == 130
+        assert {name: text for name, text in contents(finished).items() if text != "begun"} == OLD
+
+        def go_on(function, points, *, keep, execution, out):
+            assert (out / "points" / "a.npz").read_text() == "begun"
+            (out / "result.nc").write_text("done")
+            return xr.Dataset({"status": ("point", ["successful"] * len(points))})
+
+        assert opfem("sweep", config, "--out", finished) == 1
+        assert "Pass --resume" in capsys.readouterr().err
+        monkeypatch.setattr("opfem.cli.sweep.compute", go_on)
+        assert opfem("sweep", config, "--out", finished, "--resume") == 0
+        assert contents(finished) == {"points/a.npz": "begun", "sweep.json": "begun", "result.nc": "done"}
+
+    def test_links(self, config, finished, tmp_path, computed, capsys):
+        (finished / "result.nc").rename(tmp_path / "elsewhere.nc")
+        (finished / "result.nc").symlink_to(tmp_path / "elsewhere.nc")
+        assert opfem("sweep", config, "--out", finished, "--force") == 1
+        assert "holds result.nc as a link" in capsys.readouterr().err
+        assert contents(finished) == OLD
+        (tmp_path / "dangling").symlink_to(tmp_path / "none")
+        assert opfem("sweep", config, "--out", tmp_path / "dangling") == 1
+        assert "is a link to" in capsys.readouterr().err
+
+    def test_results_of_another_command(self, config, finished, map_of, capsys):
+        assert opfem("palpate", map_of, "--extent", 2, 2, "--l0", 0.5, "--out", finished, "--force") == 1
+        assert "holds a sweep (sweep.json)" in capsys.readouterr().err
+        assert contents(finished) == OLD
+        (finished / "sweep.json").unlink()
+        assert opfem("sweep", config, "--out", finished, "--force") == 1
+        assert "holds the result of another command" in capsys.readouterr().err
+
+    @pytest.fixture
+    def map_of(self, config):
+        return config.parent / "map.npy"
+
+
+def test_a_file_from_notepad(config, tmp_path, computed):
+    config.write_bytes(b"\xef\xbb\xbf" + CONFIG.replace("\n", "\r\n").encode())
+    assert opfem("sweep", config, "--out", tmp_path / "out") == 0
 
 
 def test_nothing_to_go_on_with(config, tmp_path, capsys):
