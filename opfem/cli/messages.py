@@ -36,7 +36,7 @@ _ARGUMENTS = (
 )
 _FIELD = re.compile("|".join(map(re.escape, _FIELDS)) + rf"|\b(?:{_OWNERS})\.({_ARGUMENTS})\b")
 _CALL = re.compile(rf"\b(?:{_OWNERS})\(({_ARGUMENTS})=\.\.\.\)")
-_KEYWORD = re.compile(rf"""\b({_ARGUMENTS})=("[^"]*"|'[^']*'|\([^()]*\)|[\w.+-]*)""")
+_KEYWORD = re.compile(rf"""(?<![\w/\\.])({_ARGUMENTS})=("[^"]*"|'[^']*'|\([^()]*\)|[\w.+-]*)""")
 # Two names are alike from here on: "frction" and "friction" are, "frction" and "fraction" less so.
 _ALIKE = 0.7
 
@@ -48,6 +48,7 @@ def in_options(message: str) -> str:
         value = found[2].strip("\"'()").replace(",", "")
         return f"{_option(found[1])} {value}".rstrip()
 
+    message = message.replace("holds no variable ", "holds no --variable ")
     message = _CALL.sub(lambda found: _option(found[1]), message)
     message = _FIELD.sub(lambda found: _FIELDS.get(found[0]) or _option(found[1]), message)
     return _KEYWORD.sub(keyword, message)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from rich.table import Table
 from .._types import ScalarLike
 from ..compilation import cache_compilation, silence_alarm
 from ..io import read_thickness
-from ..measurement import EXAMPLE_LAYER, ThicknessMap, example_map
+from ..measurement import EXAMPLE_LAYER, MeasurementError, ThicknessMap, example_map
 from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
 from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
 
@@ -50,15 +51,27 @@ def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | Thi
             raise ValueError("--l0 is needed: the unloaded thickness, a number in mm or the path of a map.")
         return loaded, EXAMPLE_LAYER
     try:
-        return loaded, float(options.l0)
+        number = float(options.l0)
     except ValueError:
-        unloaded = read_thickness(options.l0, variable=options.l0_variable, **grid)
+        unloaded = _of_l0(lambda: read_thickness(str(options.l0), variable=options.l0_variable, **grid))
+    else:
+        if options.l0_variable is not None:
+            raise ValueError(f"--l0-variable needs the path of a map in --l0, got the number {options.l0}.")
+        return loaded, number
     if unloaded.shape != loaded.shape:
         raise ValueError(
             f"--l0 [pixels] must be on the grid of MAP, {loaded.shape} rows and columns, got {unloaded.shape}. "
             "Resample one of them; in Python, ThicknessMap takes another extent for each."
         )
     return loaded, unloaded
+
+
+def _of_l0(read: Callable[[], ThicknessMap]) -> ThicknessMap:
+    """Say of which of the two maps an error is."""
+    try:
+        return read()
+    except MeasurementError as cause:
+        raise MeasurementError(f"--l0 {cause}".replace("holds no variable", "holds no --l0-variable")) from cause
 
 
 def state_experiment(
