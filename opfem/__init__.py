@@ -27,6 +27,8 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("opfem")
+    if name == "__all__":
+        return __dir__()
     unknown = AttributeError(f"module 'opfem' has no attribute {name!r}")
     if name.startswith("_"):
         raise unknown

@@ -66,6 +66,7 @@ from .solvers import (
     Explicit as Explicit,
     Newton as Newton,
     Solution as Solution,
+    compiler_options as compiler_options,
     solve as solve,
 )
 from .sweeps import (
