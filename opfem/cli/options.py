@@ -24,11 +24,35 @@ class MapOptions:
     extent: Annotated[
         tuple[float, float] | None, Parameter(help="LX LY from the first to the last sample in mm; this or --spacing.")
     ] = None
-    spacing: Annotated[float | None, Parameter(help="Distance between samples in mm, the same in x and y.")] = None
+    spacing: Annotated[
+        tuple[float, ...] | None,
+        Parameter(help="DX DY between samples in mm, or one number for both; this or --extent.", consume_multiple=True),
+    ] = None
     unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
+    scale: Annotated[
+        float | None, Parameter(help="Thickness of one count in µm, for files of counts; instead of --unit.")
+    ] = None
+    missing: Annotated[
+        str | None,
+        Parameter(
+            help="Numbers that mark missing pixels in the files, as in 0,65535; none if odd numbers are thickness.",
+            allow_leading_hyphen=True,
+        ),
+    ] = None
+    mask: Annotated[
+        str | None,
+        Parameter(help="Image or array of the pixels of MAP that are no data: 0 is data, all else is not."),
+    ] = None
+    max_missing: Annotated[float, Parameter(help="Largest fraction of missing pixels to accept.")] = 0.5
     std: Annotated[float | None, Parameter(help="Standard deviation of the thickness noise in mm.")] = None
-    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
+    variable: Annotated[
+        str | None, Parameter(help="Name of the array, where MAP holds several; as in scan.thickness.")
+    ] = None
     l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
+    max_bytes: Annotated[
+        int | None,
+        Parameter(help="Largest array to load; a compressed one may be far larger than its file. Default: 512 MiB."),
+    ] = None
     smooth: Annotated[
         float | None,
         Parameter(help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element."),

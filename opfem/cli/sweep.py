@@ -223,6 +223,8 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
     given |= {name: float(column[0]) for name, column in points.columns.items()}
     if "l0" in given:
         given["l0"] = _path(str(given["l0"]), folder)
+    if "mask" in given:
+        given["mask"] = _path(given["mask"], folder)
     path = str(coin_file()) if given["map"] == "coin" else _path(given["map"], folder)
     reading, layer, contact = _group(MapOptions, given), _group(LayerOptions, given), _group(ContactOptions, given)
     return _Inputs(path, reading, layer, contact, given.get("increments"))
@@ -246,6 +248,9 @@ def _converted(what: str, hint: Any, value: Any) -> Any:
         if typing.get_origin(choice) is Literal:
             if value in parts:
                 return value
+        elif typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
+            items = value if isinstance(value, list) else [value]
+            return tuple(_converted(what, parts[0], item) for item in items)
         elif typing.get_origin(choice) is tuple:
             if isinstance(value, list) and len(value) == len(parts):
                 return tuple(_converted(what, part, item) for part, item in zip(parts, value, strict=True))
