@@ -37,7 +37,7 @@ def read_mask(map_path: Path, mask: Any, shape: tuple[int, ...], max_bytes: int)
     if array.shape != shape:
         raise MeasurementError(f"{where} must have the map's shape {shape} (ny, nx), got {array.shape}.")
     values = np.unique(array)
-    if array.dtype.kind not in "biuf" or values.size > 2 or (values.size == 2 and 0 not in values):
+    if array.dtype.kind not in "biuf" or np.isnan(values).any() or not 0 <= (values != 0).sum() <= 1:
         raise MeasurementError(
             f"{where} must be black and white: 0 for data and one other number for no data, got "
             f"{values.size} values from {values[0]} to {values[-1]}."

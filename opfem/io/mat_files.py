@@ -5,6 +5,7 @@ one is no concern of the others. Source: MathWorks, MAT-File Format, R2024b, cha
 """
 
 import io
+import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -32,6 +33,9 @@ _CLASSES = {
     "opaque": "an object (a table, string or class of MATLAB)",
     "function": "a function",
 }
+_PARTS = frozenset((1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 14, 16, 17, 18))  # types of data: numbers, matrices, text
+_INT32, _CONTAINERS = 5, (1, 2, 3)  # the type that sizes are of; cells, structs, objects
+_DEEPEST = 32  # structs within structs
 _BYTES = 8  # of a double, the largest number that MATLAB stores
 
 
@@ -89,7 +93,7 @@ def _elements(reading: Reading, order: str) -> Iterator[_Element]:
             tag = file.read(8)
             type_, count = struct.unpack(order + "II", tag) if len(tag) == 8 else (0, 0)
             if type_ not in (_MATRIX, _COMPRESSED) or at + 8 + count > size:
-                reading.notes.append(f"damaged or cut off from byte {at} on")
+                reading.notes.append(f"the file is damaged or cut off from byte {at} on")
                 return
             yield _Element(at + 8, count, type_)
             at += 8 + count
@@ -122,6 +126,34 @@ def _whole(reading: Reading, order: str, element: _Element) -> bytes:
     return inflated
 
 
+def _check_parts(stored: bytes, order: str, deep: int = 0) -> None:
+    """Check tags and sizes of what a matrix is made of, to the last field of a struct.
+
+    SciPy 1.17 ends the process where a type of data is unknown, and makes cells of any size before it reads them.
+    """
+    at, is_container = 0, False
+    while at < len(stored):
+        tag = stored[at : at + 8]
+        if len(tag) < 8:
+            raise MeasurementError("is damaged: it ends within a tag.")
+        type_, count = struct.unpack(order + "II", tag)
+        if type_ >> 16:  # up to 4 bytes of data, in the tag itself
+            part, count, following = tag[4:], type_ >> 16, at + 8
+        else:
+            part, following = stored[at + 8 : at + 8 + count], at + 8 + count + -count % 8
+        if type_ & 0xFFFF not in _PARTS or len(part) < count or deep > _DEEPEST:
+            raise MeasurementError(f"is damaged: it holds data of type {type_ & 0xFFFF} with {count} bytes.")
+        if at == 0:
+            is_container = bool(part) and struct.unpack(order + "I", part[:4])[0] & 0xFF in _CONTAINERS
+        elif (
+            is_container and type_ == _INT32 and math.prod(np.frombuffer(part, order + "i4").tolist()) * 8 > len(stored)
+        ):
+            raise MeasurementError("is damaged: it holds fewer cells or structs than it says.")
+        if type_ == _MATRIX:
+            _check_parts(part, order, deep + 1)
+        at = following
+
+
 def _variable(reading: Reading, header: bytes, order: str, element: _Element) -> tuple[str, Entry]:
     head = _head(reading, order, element)
     [(name, shape, kind)] = scipy.io.whosmat(io.BytesIO(header + head))
@@ -129,7 +161,9 @@ def _variable(reading: Reading, header: bytes, order: str, element: _Element) ->
 
     def load() -> np.ndarray:
         check_size(shape, _BYTES, reading.max_bytes)
-        contents = scipy.io.loadmat(io.BytesIO(header + _whole(reading, order, element)))
+        whole = _whole(reading, order, element)
+        _check_parts(whole[8:], order)
+        contents = scipy.io.loadmat(io.BytesIO(header + whole))
         return next(value for key, value in contents.items() if not key.startswith("__"))
 
     if kind == "struct":

@@ -80,6 +80,8 @@ def _without_words(table: Table) -> tuple[Table, list[str]]:
     ):
         names += [table.words.get((top, i), "").lower() for i in range(nx)]
         top += 1
+    if top == ny:
+        raise not_a_number(table, *min(table.words))
     table = table.part(slice(top, None), slice(None))
     rows = range(len(table.lines))
     if (
@@ -206,11 +208,12 @@ def _single_axis(table: Table) -> tuple[Table, _Axis | None, _Axis | None] | Non
 
 
 def _factors(reading: Reading, x: _Axis | None, y: _Axis | None) -> list[float]:
-    """Span of coordinates over that of the given extent, for those that do more than count."""
-    if reading.extent is None:
+    """Span of coordinates over that of the given extent; nothing where they only count."""
+    axes = [axis for axis in (x, y) if axis is not None]
+    if reading.extent is None or all(axis.is_index for axis in axes):
         return []
-    axes = zip((x, y), reading.extent, strict=True)
-    return [float(np.ptp(axis.positions)) / length for axis, length in axes if axis is not None and not axis.is_index]
+    lengths = [length for axis, length in zip((x, y), reading.extent, strict=True) if axis is not None]
+    return [float(np.ptp(axis.positions)) / length for axis, length in zip(axes, lengths, strict=True)]
 
 
 def _fits(reading: Reading, x: _Axis, y: _Axis) -> bool:

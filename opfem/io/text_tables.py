@@ -51,7 +51,7 @@ _PLAIN = re.compile(r"[\d.eE+-]*", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?", re.ASCII)
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d*(?:[eEdD][+-]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+", re.ASCII)
-_SPACED = re.compile(r"[\d,.] +[+-.\d]", re.ASCII)
+_SPACED = re.compile(r"[\d,.] +[-+.\d]", re.ASCII)
 _ENCODINGS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 SHOWN = 40  # characters of a cell that a message repeats
 
@@ -121,9 +121,10 @@ def _decoded(stored: bytes) -> str:
     try:
         text = stored.decode(encoding)
     except UnicodeDecodeError:
-        text = stored.decode("cp1252" if encoding == "utf-8" else encoding)  # what spreadsheets write on Windows
+        text = stored.decode("latin-1")  # as spreadsheets on Windows write µ
     if "\0" in text:
-        raise MeasurementError(f"line {text[: text.index(chr(0))].count(chr(10)) + 1} holds a zero byte: not text.")
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise MeasurementError(f"line {line} holds a zero byte and is no text; save it as text (CSV) in UTF-8.")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -211,7 +212,7 @@ def _parsed(cells: list[list[str]], lines: list[int], delimiter: str) -> Table:
             else:
                 words[j, i] = cell
     if np.isinf(numbers).any():
-        j, i = np.argwhere(np.isinf(numbers))[0]
+        j, i = np.argwhere(np.isinf(numbers))[0].tolist()
         raise MeasurementError(f"{place(lines[j], i)}: {cells[j][i][:SHOWN]} is too large a number.")
     return Table(numbers, np.array([[not cell for cell in row] for row in cells]), words, lines)
 

@@ -90,6 +90,7 @@ def read_thickness(
     numbers = _loaded(path, entry)
     extent, spacing = _grid(path, entry, numbers.shape, extent, spacing, notes)
     absent = _absent(path, numbers, missing, mask, max_bytes, max_missing)
+    numbers = numbers.astype(float)
     if not _is_none(missing):
         _check_piles(path, numbers, absent, notes)
     thickness = np.where(absent, np.median(numbers[~absent]), numbers) * size
@@ -221,20 +222,19 @@ def _named(entries: dict[str, Entry], variable: str) -> Entry | None:
 
 def _choose(path: Path, entries: dict[str, Entry], variable: str | None, notes: list[str]) -> Entry:
     """Pick the array that is the map: the one asked for, or the only one that can be."""
+    odd = "".join(f"; {note}" for note in notes)
     if not entries:
-        raise MeasurementError(
-            f"{path}: the file holds no variable" + "".join(f"; it is {note}" for note in notes) + "."
-        )
+        raise MeasurementError(f"{path}: the file holds no variable{odd}.")
     if variable is not None:
         found = guarded(path, lambda: _named(entries, variable))
         if found is None:
-            raise MeasurementError(f"{path}: holds no variable {variable!r}; it holds {_listing(entries)}.")
+            raise MeasurementError(f"{path}: holds no variable {variable!r}; it holds {_listing(entries)}{odd}.")
         name, entry = f"variable {variable!r}", found
     else:
         maps = [name for name, entry in entries.items() if _fault(entry) is None]
         if len(maps) > 1 or (not maps and len(entries) > 1):
             which = "several variables could be the map" if maps else "none of its variables is a 2-D map"
-            raise MeasurementError(f"{path}: {which}; pass variable= to name one of: {_listing(entries)}.")
+            raise MeasurementError(f"{path}: {which}; pass variable= to name one of: {_listing(entries)}{odd}.")
         chosen = maps[0] if maps else next(iter(entries))
         name, entry = f"variable {chosen!r}" if chosen else "the array", entries[chosen]
         unusual = ("damaged", "objects", "an object", "an external", "a link", "stored")
@@ -243,7 +243,7 @@ def _choose(path: Path, entries: dict[str, Entry], variable: str | None, notes: 
     if fault:
         inside = f"; it holds {_listing(entries)}" if entry.fields else ""
         raise MeasurementError(
-            f"{path}: {name} must be a 2-D map (ny, nx) of thickness, got {fault}, shape {entry.shape}{inside}."
+            f"{path}: {name} must be a 2-D map (ny, nx) of thickness, got {fault}, shape {entry.shape}{inside}{odd}."
         )
     return entry
 
@@ -254,7 +254,7 @@ def _loaded(path: Path, entry: Entry) -> np.ndarray:
         raise MeasurementError(
             f"{path}: must hold real numbers of shape {entry.shape}, got {array.dtype} {array.shape}."
         )
-    return array if array.dtype.kind != "f" else array.astype(array.dtype.newbyteorder("="))
+    return array
 
 
 def _grid(
