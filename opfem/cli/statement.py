@@ -14,7 +14,7 @@ from ..measurement import EXAMPLE_LAYER, MeasurementWarning, ThicknessMap, examp
 from ..model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
 from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
 
-_SHARED = ("extent", "spacing", "unit", "scale", "max_missing")  # by the loaded and the unloaded map
+_SHARED = ("extent", "unit", "scale", "max_missing")  # by the loaded and the unloaded map
 
 
 def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | ThicknessMap]:
@@ -28,7 +28,8 @@ def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | Thi
         ValueError: When options are missing or contradict each other.
         MeasurementError: For anything wrong with a file.
     """
-    how: dict[str, Any] = {name: getattr(options, name) for name in _SHARED} | {"missing": _missing(options.missing)}
+    how: dict[str, Any] = {name: getattr(options, name) for name in _SHARED}
+    how |= {"spacing": _spacing(options.spacing), "missing": _missing(options.missing)}
     if options.max_bytes is not None:
         how["max_bytes"] = options.max_bytes
     if path == "example":
@@ -64,6 +65,12 @@ def _read(path: str, **how: Any) -> ThicknessMap:
     for warning in said:
         console.print(f"opfem: {warning.message}", style="yellow", markup=False, soft_wrap=True)
     return read
+
+
+def _spacing(stated: tuple[float, ...] | None) -> float | tuple[float, ...] | None:
+    if stated is not None and len(stated) > 2:
+        raise ValueError(f"--spacing [mm] must be two numbers, DX DY, or one for both, got {stated}.")
+    return stated[0] if stated is not None and len(stated) == 1 else stated
 
 
 def _missing(stated: str | None) -> Any:
