@@ -156,6 +156,29 @@ def test_bit_flips_never_pass_as_another_error(tmp_path):
     assert refused > 10
 
 
+class TestNumberTypes:
+    @pytest.mark.parametrize("name", FILES)
+    @pytest.mark.parametrize("dtype", ["f4", ">f4", "f2", ">f8", "i2", ">u2", "u1", "i8"])
+    def test_of_arrays_become_float64(self, tmp_path, name, dtype):
+        if name.endswith(".mat") and dtype == "f2":
+            pytest.skip("MATLAB has no 16-bit floats")
+        counts = np.random.default_rng(0).integers(90, 110, SHAPE).astype(dtype)
+        save(tmp_path / name, counts)
+        read = read_thickness(tmp_path / name, extent=EXTENT, scale=3.7)
+        assert read.values.dtype == np.float64
+        np.testing.assert_allclose(read.values, 3.7e-3 * counts.astype(float), ROUNDOFF)
+
+    @pytest.mark.parametrize("kind", [np.float32, np.float16, np.int64, lambda v: np.array(v, ">f4")])
+    def test_of_arguments(self, tmp_path, values, kind):
+        np.save(tmp_path / "a.npy", values)
+        read = read_thickness(
+            tmp_path / "a.npy", spacing=kind(1), origin=(kind(1), kind(2)), std=kind(1), scale=float(kind(1)) * 1e3
+        )
+        leaves = [read.extent, read.origin, read.std, read.values]
+        assert {leaf.dtype.name for leaf in leaves} == {"float64"}
+        assert read.extent.tolist() == [10.0, 5.0]
+
+
 class TestUnits:
     @pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("um", 1e3), ("µm", 1e3), ("m", 1e-3)])
     def test_converts(self, tmp_path, values, unit, factor):
