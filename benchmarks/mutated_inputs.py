@@ -335,6 +335,12 @@ def verdicts(count: int) -> Iterator[tuple[str, int, Verdict]]:
         name, number = names[index % len(names)], index // len(names)
         yield name, number, worker.judge(name, number)
     worker.process.kill()
+    worker.process.wait()
+
+
+def _of_workers() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
@@ -357,7 +363,7 @@ def main() -> None:
     print(f"{'format':10}", *(f"{outcome:>9}" for outcome in OUTCOMES))
     for name, counts in table.items():
         print(f"{name:10}", *(f"{counts[outcome]:9}" for outcome in OUTCOMES))
-    print(MEANING, f"{time.process_time() - start + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime:.0f} CPU s.")
+    print(MEANING, f"{time.process_time() - start + _of_workers():.0f} CPU s.")
     return None
 
 

@@ -4,6 +4,7 @@ Links are followed one part at a time and only within the file: what would open 
 """
 
 import math
+import zlib
 
 import h5py
 import numpy as np
@@ -12,6 +13,7 @@ from ..measurement import MeasurementError
 from .entry import Entry, Reading, check_size, damaged, other
 
 _MATLAB = {"char": "text", "cell": "a cell array", "struct": "a struct", "logical": "true/false values"}
+_MOST_INFLATION = 1032  # times, by deflate
 _LONGEST_CHAIN = 16  # soft links in a row; a longer one leads in a circle
 
 
@@ -85,7 +87,10 @@ def _entry(reading: Reading, node: h5py.Group | h5py.Dataset, matlab: bool) -> E
     def load() -> np.ndarray:
         check_size(shape, item, reading.max_bytes)
         with h5py.File(reading.path, "r") as file:
-            array = np.asarray(file[name])
+            stored = file[name]
+            assert isinstance(stored, h5py.Dataset)
+            _check_inflation(stored, reading.max_bytes)
+            array = np.asarray(stored)
         return array.T if matlab else array
 
     return Entry(kind, shape, load)
@@ -113,3 +118,16 @@ def _is_whole(node: h5py.Dataset) -> bool:
         return node.id.get_storage_size() == node.nbytes
     pieces = math.prod(-(-length // piece) for length, piece in zip(node.shape, node.chunks, strict=True))
     return node.id.get_num_chunks() == pieces
+
+
+def _check_inflation(node: h5py.Dataset, max_bytes: int) -> None:
+    """Refuse compressed chunks that inflate beyond the limit; HDF5 inflates them to whatever size they have."""
+    if node.compression != "gzip":
+        return
+    for index in range(node.id.get_num_chunks()):
+        chunk = node.id.get_chunk_info(index)
+        if chunk.size * _MOST_INFLATION <= max_bytes:
+            continue
+        _, stored = node.id.read_direct_chunk(chunk.chunk_offset)
+        if len(zlib.decompressobj().decompress(stored, max_bytes + 1)) > max_bytes:
+            raise MeasurementError(f"is damaged: a chunk inflates to more than max_bytes={max_bytes}.")

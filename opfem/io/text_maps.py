@@ -208,12 +208,17 @@ def _single_axis(table: Table) -> tuple[Table, _Axis | None, _Axis | None] | Non
 
 
 def _factors(reading: Reading, x: _Axis | None, y: _Axis | None) -> list[float]:
-    """Span of coordinates over that of the given extent; nothing where they only count."""
-    axes = [axis for axis in (x, y) if axis is not None]
-    if reading.extent is None or all(axis.is_index for axis in axes):
-        return []
-    lengths = [length for axis, length in zip((x, y), reading.extent, strict=True) if axis is not None]
-    return [float(np.ptp(axis.positions)) / length for axis, length in zip(axes, lengths, strict=True)]
+    """Span of coordinates over that of the given grid, for those that do more than count."""
+    factors = []
+    for along, axis in enumerate((x, y)):
+        if axis is None or axis.is_index:
+            continue
+        if reading.extent is not None:
+            factors.append(float(np.ptp(axis.positions)) / reading.extent[along])
+        elif reading.spacing is not None:
+            steps = axis.positions.size - 1
+            factors.append(float(np.ptp(axis.positions)) / (steps * reading.spacing[along]))
+    return factors
 
 
 def _fits(reading: Reading, x: _Axis, y: _Axis) -> bool:
@@ -228,10 +233,11 @@ def _check_spans(reading: Reading, x: _Axis | None, y: _Axis | None, shape: tupl
     if not factors or axis is None or any(np.allclose(factors, unit, _SAME) for unit in _UNITS):
         return
     spans = " × ".join(f"{np.ptp(axis.positions):g}" for axis in (x, y) if axis is not None)
-    said = f"{axis.where}: the coordinates span {spans}, extent= says {reading.extent} mm"
+    grid = f"extent= {reading.extent}" if reading.extent is not None else f"spacing= {reading.spacing}"
+    said = f"{axis.where}: the coordinates span {spans}, which is not {grid} mm"
     if len(factors) == 2 and abs(factors[0] / factors[1] - 1) > _SAME:
         raise MeasurementError(f"{said}; the map has (ny, nx) = {shape} samples. Which is right?")
-    reading.notes.append(f"{said}, which is used")
+    reading.notes.append(f"{said}; what was given is used")
 
 
 def _ascending(values: np.ndarray, x: _Axis | None, y: _Axis | None) -> np.ndarray:

@@ -4,8 +4,10 @@ tifffile reads them; LZW and other compressions for which it needs imagecodecs a
 """
 
 import logging
+import lzma
 import math
 import xml.etree.ElementTree
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +24,8 @@ _UNITS |= {"millimeter": 1.0, "millimeters": 1.0, "m": 1e3, "inch": 25.4, "inche
 
 _PILLOW_MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
 _LONGEST_XML = 2**24
+# tifffile inflates a strip to whatever size it has.
+_INFLATERS = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 
 
 def list_tiff(reading: Reading) -> dict[str, Entry]:
@@ -74,10 +78,24 @@ def _image(reading: Reading, file: tifffile.TiffFile, index: int) -> Entry:
     def load() -> np.ndarray:
         check_size(shape, item, reading.max_bytes)
         with _open(reading) as again:
+            _check_inflation(reading, again.series[index])
             pixels = _decoded(reading, again.series[index])
         return pixels if (offset, slope) == (0, 1) else offset + slope * pixels.astype(float)
 
     return Entry(kind, shape, load, spacing=_spacing(reading, file, index))
+
+
+def _check_inflation(reading: Reading, series: tifffile.TiffPageSeries) -> None:
+    """Refuse compressed strips that hold more than their whole image."""
+    page = series.keyframe
+    inflater = _INFLATERS.get(page.compression)
+    if inflater is None:
+        return
+    with open(reading.path, "rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            if len(inflater().decompress(file.read(count), page.nbytes + 1)) > page.nbytes:
+                raise MeasurementError(f"is damaged: a strip of an image of {page.nbytes} bytes inflates to more.")
 
 
 def _decoded(reading: Reading, series: tifffile.TiffPageSeries) -> np.ndarray:

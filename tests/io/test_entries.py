@@ -2,11 +2,13 @@
 
 import tracemalloc
 import zipfile
+import zlib
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
+import tifffile
 
 from opfem.io import read_thickness
 from opfem.measurement import MeasurementError, MeasurementWarning
@@ -140,6 +142,39 @@ class TestDamage:
             file.create_dataset("L1", (4, 6), "f8", chunks=(2, 6), fillvalue=0.4)[:2] = 0.5
         with pytest.raises(MeasurementError, match="got damaged or never wholly written"):
             read(tmp_path / "a.h5")
+
+
+class TestInflation:
+    """Compressed data that hold more than they state."""
+
+    BOMB = zlib.compress(bytes(2 * 10**8), 9)
+
+    def test_of_a_chunk(self, tmp_path):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            node = file.create_dataset("L1", (4, 6), "f8", chunks=(4, 6), compression="gzip")
+            node.id.write_direct_chunk((0, 0), self.BOMB)
+        with pytest.raises(MeasurementError, match="is damaged: a chunk inflates to more than max_bytes=1000000"):
+            read(tmp_path / "a.h5", max_bytes=10**6)
+
+    def test_of_a_strip(self, tmp_path, monkeypatch):
+        tifffile.imwrite(tmp_path / "a.tif", VALUES, compression="zlib")
+        with tifffile.TiffFile(tmp_path / "a.tif") as file:
+            offsets, counts = (file.pages.first.tags[name] for name in ("StripOffsets", "StripByteCounts"))
+        stored = bytearray((tmp_path / "a.tif").read_bytes())
+        for tag, value in ((offsets, len(stored)), (counts, len(self.BOMB))):
+            size = 2 if tag.dtype == 3 else 4
+            stored[tag.valueoffset : tag.valueoffset + size] = value.to_bytes(size, "little")
+        (tmp_path / "a.tif").write_bytes(stored + self.BOMB)
+        with pytest.raises(MeasurementError, match="a strip of an image of 192 bytes inflates to more"):
+            read(tmp_path / "a.tif")
+
+    @pytest.mark.parametrize("save", [save_mat5_small, save_npz])
+    def test_of_a_variable(self, tmp_path, save):
+        path = tmp_path / ("a.mat" if save is save_mat5_small else "a.npz")
+        save(path, L1=np.zeros((4000, 3000)))
+        assert path.stat().st_size < 10**6
+        with pytest.raises(MeasurementError, match="takes 96 MB once loaded, above max_bytes=50000000"):
+            read(path, max_bytes=5 * 10**7)
 
 
 class TestOtherThings:

@@ -156,13 +156,24 @@ class TestHeadersAndCoordinates:
 
     def test_span_of_another_size_is_said(self, tmp_path):
         with pytest.warns(
-            MeasurementWarning, match=r"line 1, column 2: the coordinates span 2\.5 × 1\.5, extent= says"
+            MeasurementWarning, match=r"line 1, column 2: the coordinates span 2\.5 × 1\.5, which is not"
         ):
             check(read(tmp_path, text(with_axes("", [f"{0.5 * i + 0.5}" for i in range(6)], ["0.5", "1", "1.5", "2"]))))
 
     def test_span_of_another_shape_is_refused(self, tmp_path):
-        with pytest.raises(MeasurementError, match=r"span 5 × 6, extent= says.*Which is right"):
-            read(tmp_path, text(with_axes("", X, ["0", "2", "4", "6"])))
+        with pytest.raises(MeasurementError, match=r"span 5 × 6, which is not extent= \(5\.0, 3\.0\) mm; .*right"):
+            read(tmp_path, text(with_axes("", [f"{i + 0.5}" for i in range(6)], ["0", "2", "4", "6"])))
+
+    def test_spacing_is_held_against_them_too(self, tmp_path):
+        rows = text(with_axes("", [f"{i + 0.5}" for i in range(6)], ["1", "2", "3", "4"]))
+        check(read(tmp_path, rows, extent=None, spacing=1.0))
+        with pytest.warns(
+            MeasurementWarning, match=r"span 5 × 3, which is not spacing= \(0\.7, 0\.7\) mm; what was given"
+        ):
+            read(tmp_path, rows, extent=None, spacing=0.7)
+
+    def test_positions_of_columns_and_an_index_of_rows(self, tmp_path):
+        check(read(tmp_path, text(with_axes("", [f"{i + 0.5}" for i in range(6)], [str(j) for j in range(4)]))))
 
     def test_corner_that_may_be_a_pixel_is_refused(self, tmp_path):
         with pytest.raises(
