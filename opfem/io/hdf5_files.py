@@ -1,6 +1,6 @@
 """Datasets of HDF5 files: .mat of version 7.3 as MATLAB shows it, others as h5py shows them.
 
-Links are followed one part at a time and only within the file: what would open another one is named and passed by.
+Links are followed one part at a time and only within the file: what would open another one is named and passed over.
 """
 
 import math

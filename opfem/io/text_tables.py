@@ -106,11 +106,9 @@ def read_table(path: Path, notes: list[str]) -> Table:
     cells = _rectangle([row for _, row in rows], [number for number, _ in rows], notes)
     table = _parsed(cells, [number for number, _ in rows], delimiter)
     _check_gaps(table)
-    others = [len(cell) for row in cells for cell in row[:-1] if cell]
-    if not text.endswith("\n") and len(cells[-1][-1]) < min(others, default=0):
-        notes.append(
-            f"the last number, {cells[-1][-1]!r}, is shorter than all others and ends the file: is it cut off?"
-        )
+    last, others = cells[-1][-1], (len(cell) for row in cells for cell in row[:-1] if cell)
+    if last and not text.endswith("\n") and len(last) < min(others, default=0):
+        notes.append(f"the last number, {last!r}, is shorter than all others and ends the file: is it cut off?")
     return table
 
 

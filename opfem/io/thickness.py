@@ -238,7 +238,7 @@ def _choose(path: Path, entries: dict[str, Entry], variable: str | None, notes: 
         chosen = maps[0] if maps else next(iter(entries))
         name, entry = f"variable {chosen!r}" if chosen else "the array", entries[chosen]
         unusual = ("damaged", "objects", "an object", "an external", "a link", "stored")
-        notes += [f"{name} was passed by: {e.kind}" for name, e in entries.items() if e.kind.startswith(unusual)]
+        notes += [f"{name} was passed over: {e.kind}" for name, e in entries.items() if e.kind.startswith(unusual)]
     fault = _fault(entry)
     if fault:
         inside = f"; it holds {_listing(entries)}" if entry.fields else ""

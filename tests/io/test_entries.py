@@ -85,7 +85,7 @@ class TestDamage:
         save(path, L1=VALUES, L0=OTHER)
         with zipfile.ZipFile(path) as archive:
             self.spoil(path, archive.getinfo("L0.npy").header_offset + 60)
-        with pytest.warns(MeasurementWarning, match=r"a\.npz: L0 was passed by: damaged \("):
+        with pytest.warns(MeasurementWarning, match=r"a\.npz: L0 was passed over: damaged \("):
             np.testing.assert_array_equal(read(path), VALUES)
         np.testing.assert_array_equal(read(path, "L1"), VALUES)
         with pytest.raises(MeasurementError, match=r"variable 'L0' must be a 2-D map .* got damaged"):
@@ -95,7 +95,7 @@ class TestDamage:
         path = tmp_path / "a.mat"
         save_mat5_small(path, L1=VALUES, L0=OTHER)
         self.spoil(path, path.stat().st_size - 60)
-        with pytest.warns(MeasurementWarning, match="variable 2 was passed by: damaged"):
+        with pytest.warns(MeasurementWarning, match="variable 2 was passed over: damaged"):
             np.testing.assert_array_equal(read(path), VALUES)
 
     def test_file_cut_off_behind_the_map(self, tmp_path):
@@ -178,9 +178,9 @@ class TestInflation:
 
 
 class TestOtherThings:
-    def test_objects_are_named_and_passed_by(self, tmp_path):
+    def test_objects_are_named_and_passed_over(self, tmp_path):
         np.savez(tmp_path / "a.npz", L1=VALUES, about=np.array([{"day": 1}], dtype=object))
-        with pytest.warns(MeasurementWarning, match="about was passed by: objects, which opfem never unpickles"):
+        with pytest.warns(MeasurementWarning, match="about was passed over: objects, which opfem never unpickles"):
             np.testing.assert_array_equal(read(tmp_path / "a.npz"), VALUES)
         with pytest.raises(MeasurementError, match="got objects, which opfem never unpickles"):
             read(tmp_path / "a.npz", "about")
@@ -284,5 +284,5 @@ class TestLinks:
         save_mat73(tmp_path / "a.mat", L1=VALUES)
         with h5py.File(tmp_path / "a.mat", "a") as file:
             file["L0"] = h5py.ExternalLink("other.mat", "/L0")
-        with pytest.warns(MeasurementWarning, match=r"L0 was passed by: an external link, to other\.mat"):
+        with pytest.warns(MeasurementWarning, match=r"L0 was passed over: an external link, to other\.mat"):
             np.testing.assert_array_equal(read(tmp_path / "a.mat"), VALUES)
