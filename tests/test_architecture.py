@@ -31,6 +31,8 @@ LIBRARY_HOMES = {
     "xarray": {"results", "io", "sweeps", "plot", "cli"},
     "h5py": {"io"},
     "scipy.io": {"io"},
+    "tifffile": {"io"},
+    "PIL": {"io"},
     "pyvista": {"io", "plot"},
     "vtk": {"io", "plot"},
     "matplotlib": {"plot"},

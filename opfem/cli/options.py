@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
 
-from .quantities import NewFile, NumberOrFile, Quantity, count, not_negative, positive, whole
+from .quantities import NewFile, NumberOrFile, OldFile, Quantity, count, not_negative, positive, whole
 
 # The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
@@ -36,16 +36,57 @@ class MapOptions:
         ),
     ] = None
     spacing: Annotated[
-        float | None,
-        Parameter(help="Distance between samples in mm, the same in x and y.", validator=positive("mm")),
+        tuple[float, ...] | None,
+        Parameter(
+            help="DX DY between samples in mm, or one number for both; this or --extent.",
+            consume_multiple=True,
+            validator=positive("mm", "one positive number, or two"),
+        ),
     ] = None
     unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
+    scale: Annotated[
+        float | None,
+        Parameter(
+            help="Thickness of one count in µm, for files of counts; instead of --unit.", validator=positive("µm")
+        ),
+    ] = None
+    missing: Annotated[
+        str | None,
+        Parameter(
+            help="Numbers that mark missing pixels in the files, as in 0,65535; none if odd numbers are thickness.",
+            allow_leading_hyphen=True,
+        ),
+    ] = None
+    mask: Annotated[
+        str | None,
+        Parameter(
+            help="Image or array of the pixels of MAP that are no data: 0 is data, all else is not.",
+            validator=OldFile("an image or array"),
+        ),
+    ] = None
+    max_missing: Annotated[
+        float,
+        Parameter(
+            help="Largest fraction of missing pixels to accept.",
+            validator=Quantity("1", "a number from 0 to 1", 0.0, 1.0),
+        ),
+    ] = 0.5
     std: Annotated[
         float | None,
         Parameter(help="Standard deviation of the thickness noise in mm.", validator=positive("mm")),
     ] = None
-    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
+    variable: Annotated[
+        str | None, Parameter(help="Name of the array, where MAP holds several; as in scan.thickness.")
+    ] = None
     l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
+    max_bytes: Annotated[
+        int | None,
+        Parameter(
+            help="Largest array to load; a compressed one may be far larger than its file. Default: 512 MiB.",
+            validator=Quantity("bytes", "a whole number of at least 1", 1.0),
+            converter=whole,
+        ),
+    ] = None
     smooth: Annotated[
         float | None,
         Parameter(

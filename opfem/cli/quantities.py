@@ -21,6 +21,7 @@ class Quantity:
         unit: Their unit.
         expected: What they must be, in words.
         least: The lowest of them.
+        most: The highest of them.
         above: Whether they must lie above `least`.
         infinite: Whether infinity is one of them.
     """
@@ -28,6 +29,7 @@ class Quantity:
     unit: str
     expected: str
     least: float = -math.inf
+    most: float = math.inf
     above: bool = False
     infinite: bool = False
 
@@ -45,7 +47,7 @@ class Quantity:
     def _takes(self, number: float | int) -> bool:
         if math.isnan(number) or (math.isinf(number) and not (self.infinite and number > 0)):
             return False
-        return number > self.least if self.above else number >= self.least
+        return (number > self.least if self.above else number >= self.least) and number <= self.most
 
 
 def positive(unit: str, expected: str = "a positive number", *, infinite: bool = False) -> Quantity:
@@ -98,6 +100,27 @@ class NumberOrFile:
     def wanted(self) -> str:
         """Unit and expectation, as messages say them."""
         return f"[{self.unit}] must be a positive number, or the path of {self.file}"
+
+
+@dataclass(frozen=True)
+class OldFile:
+    """A file that exists.
+
+    Args:
+        file: What it is.
+    """
+
+    file: str
+
+    def __call__(self, hint: Any, value: str | None) -> None:
+        """Raise ValueError unless there is such a file."""
+        if value is not None and not Path(value).is_file():
+            raise ValueError(f"{self.wanted}, got {value!r}: there is no such file.")
+
+    @property
+    def wanted(self) -> str:
+        """Expectation, as messages say it."""
+        return f"must be the path of {self.file}"
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
         if name == "l0" and isinstance(value, int | float) and not isinstance(value, bool):
             value = str(value)
         value = _converted(f"[inputs] {name}", _plain(hints[name]), value)
-        given[name] = _path(value, folder) if name in ("l0", "map") else value
+        given[name] = _path(value, folder) if name in ("l0", "map", "mask") else value
         for check in getattr(hints[name], "__metadata__", ()):
             _check(f"[inputs] {name}", validators(check.validator), given[name])
     given |= {name: float(column[0]) for name, column in points.columns.items()}
@@ -301,6 +301,9 @@ def _converted(what: str, hint: Any, value: Any) -> Any:
         if typing.get_origin(choice) is Literal:
             if value in parts:
                 return value
+        elif typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
+            items = value if isinstance(value, list) else [value]
+            return tuple(_converted(what, parts[0], item) for item in items)
         elif typing.get_origin(choice) is tuple:
             if isinstance(value, list) and len(value) == len(parts):
                 return tuple(_converted(what, part, item) for part, item in zip(parts, value, strict=True))
@@ -317,6 +320,8 @@ def _in_words(choice: Any) -> str:
     parts = typing.get_args(choice)
     if typing.get_origin(choice) is Literal:
         return "one of " + ", ".join(map(str, parts))
+    if typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
+        return f"{_in_words(parts[0])}, or a list of such"
     if typing.get_origin(choice) is tuple:
         return f"a list of {len(parts)}, each {_in_words(parts[0])}"
     return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(choice, "")

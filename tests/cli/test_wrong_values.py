@@ -24,7 +24,14 @@ MAPS = [
     ("--extent", "2 -2", "mm", "must be two positive numbers", "2 -2"),
     ("--extent", "2 wide", "mm", "must be two positive numbers", "'2 wide'"),
     ("--extent", "2", "mm", "must be two positive numbers", "2"),
-    ("--spacing", "0", "mm", A_NUMBER, "0"),
+    ("--spacing", "0", "mm", "must be one positive number, or two", "0"),
+    ("--spacing", "0.1 -0.1", "mm", "must be one positive number, or two", "0.1 -0.1"),
+    ("--scale", "0", "µm", A_NUMBER, "0"),
+    ("--missing", "0,hole", None, "must be numbers of the file with commas between them, or none", "'0,hole'"),
+    ("--mask", "none.png", None, "must be the path of an image or array", "'none.png': there is no such file"),
+    ("--max-missing", "1.5", "1", "must be a number from 0 to 1", "1.5"),
+    ("--max-bytes", "0", "bytes", COUNT, "0"),
+    ("--max-bytes", "1.5", "bytes", COUNT, "'1.5'"),
     ("--spacing", "inf", "mm", A_NUMBER, "inf"),
     ("--unit", "inch", None, "must be one of mm, um, µm, m", "'inch'"),
     ("--std", "0", "mm", A_NUMBER, "0"),
@@ -90,7 +97,7 @@ CONFIG = (
 
 
 # Refused once a file or folder was looked at, not by the option alone.
-LATE = ("--out", "--variable", "--l0-variable")
+LATE = ("--out", "--variable", "--l0-variable", "--missing")
 
 
 def accepted(*_, **__):
