@@ -16,6 +16,7 @@ from ..compilation import cache_compilation, silence_alarm
 from ..io import read_thickness
 from ..measurement import EXAMPLE_LAYER, MeasurementError, MeasurementWarning, ThicknessMap, example_map
 from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
+from .messages import in_options
 from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
 
 _SHARED = ("extent", "unit", "scale", "max_missing")  # by the loaded and the unloaded map
@@ -88,7 +89,7 @@ def _read(path: str, **how: Any) -> ThicknessMap:
         read = read_thickness(path, **how)
     console = Console(stderr=True, highlight=False)
     for warning in said:
-        console.print(f"opfem: {warning.message}", style="yellow", markup=False, soft_wrap=True)
+        console.print(f"opfem: {in_options(str(warning.message))}", style="yellow", markup=False, soft_wrap=True)
     return read
 
 

@@ -32,7 +32,7 @@ MAPS = [
     ("--max-missing", "1.5", "1", "must be a number from 0 to 1", "1.5"),
     ("--max-bytes", "0", "bytes", COUNT, "0"),
     ("--max-bytes", "1.5", "bytes", COUNT, "'1.5'"),
-    ("--spacing", "inf", "mm", A_NUMBER, "inf"),
+    ("--spacing", "inf", "mm", "must be one positive number, or two", "inf"),
     ("--unit", "inch", None, "must be one of mm, um, µm, m", "'inch'"),
     ("--std", "0", "mm", A_NUMBER, "0"),
     ("--variable", "none", None, "map.npy: holds no --variable", "'none'"),
