@@ -150,7 +150,8 @@ def case(name: str, path: Path, elements: tuple[int, int, int]):
     if name == "palpate":
         return lambda c10: op.solve(palpation(c10), op.Imprint(loaded), progress=False).pressure
     if name == "gradient":
-        gradient = jax.jit(jax.value_and_grad(mean_pressure))
+        options = op.compiler_options() if hasattr(op, "compiler_options") else {}  # an older checkout has none
+        gradient = jax.jit(jax.value_and_grad(mean_pressure), compiler_options=options)
         return lambda c10: gradient(loaded.values, c10)
     if name == "explicit":
         settings = op.Explicit(duration=EXPLICIT_DURATION)

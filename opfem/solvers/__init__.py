@@ -1,5 +1,6 @@
 """Solvers: implicit statics by Newton, multigrid and Krylov iterations; explicit dynamics."""
 
+from .compiling import compiler_options as compiler_options
 from .explicit import Explicit as Explicit
 from .newton import Newton as Newton
 from .solution import (

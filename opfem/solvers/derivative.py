@@ -275,26 +275,36 @@ def _solve(
     The residual of a transposed system is measured as the move that it stands for (`solve_tangent`).
     """
 
-    def correct(carry):
-        x, r, count = carry
-        change, _ = _correction(problem, tangent, transposed, held, r, settings)
-        x = jax.tree.map(jnp.add, x, change)
-        return x, jax.tree.map(jnp.subtract, b, matvec(x)), count + 1
-
-    def size(r):
+    def measure(r: Unknowns) -> tuple[Array, Unknowns | None]:
         if not transposed:
-            return problem.size(r)
+            return problem.size(r), None
         inside = _inside(problem, r, held)
-        move = tangent.precondition(inside.scaled(problem.stress_scale)).scaled(1.0 / problem.stress_scale)
-        return problem.size(r._replace(u=r.u - inside.u)) + problem.typical_stiffness * problem.size(move)
+        move = tangent.precondition(inside.scaled(problem.stress_scale))
+        pushed = problem.size(move.scaled(1.0 / problem.stress_scale))
+        return problem.size(r._replace(u=r.u - inside.u)) + problem.typical_stiffness * pushed, move
+
+    # A pass measures what the one before left, and corrects it: so each product appears, and is compiled, once.
+    def correct(carry):
+        x, target, _, count = carry
+        r = jax.tree.map(jnp.subtract, b, matvec(x))
+        size, move = measure(r)
+        target = jnp.where(count == 0, _RTOL * size, target)
+
+        def corrected():
+            change, _ = _correction(problem, tangent, transposed, held, r, settings, move)
+            return jax.tree.map(jnp.add, x, change)
+
+        solved = size <= target
+        return jax.lax.cond(solved, lambda: x, corrected), target, solved, count + 1
 
     def unfinished(carry):
-        _, r, count = carry
-        return ~(size(r) <= target) & (count < _MOST_CORRECTIONS)
+        _, _, solved, count = carry
+        return ~solved & (count <= _MOST_CORRECTIONS)
 
-    target = _RTOL * size(b)
-    x, r, _ = jax.lax.while_loop(unfinished, correct, (jax.tree.map(jnp.zeros_like, b), b, 0))
-    return jax.tree.map(lambda v: jnp.where((size(r) <= target) & is_known, v, jnp.nan), x)
+    nothing = jax.tree.map(jnp.zeros_like, b)
+    start = nothing, jnp.zeros_like(problem.typical_stiffness), jnp.asarray(False), 0
+    x, _, solved, _ = jax.lax.while_loop(unfinished, correct, start)
+    return jax.tree.map(lambda v: jnp.where(solved & is_known, v, jnp.nan), x)
 
 
 def _transposed_product(problem: Problem, x: Unknowns, fraction: Array, state: State, held: Array):
@@ -320,10 +330,18 @@ def _transposed_product(problem: Problem, x: Unknowns, fraction: Array, state: S
     return multiply
 
 
-def _correction(problem: Problem, tangent: Tangent, transposed: bool, held: Array, r: Unknowns, settings: Newton):
+def _correction(
+    problem: Problem,
+    tangent: Tangent,
+    transposed: bool,
+    held: Array,
+    r: Unknowns,
+    settings: Newton,
+    preconditioned: Unknowns | None = None,
+) -> tuple[Unknowns, Array]:
     """Solve with the tangent of the balance once, in float32; also return the relative residual it left."""
     inside = _inside(problem, r, held)
-    result = solve_tangent(problem, tangent, inside, held, settings, transposed)
+    result = solve_tangent(problem, tangent, inside, held, settings, transposed, preconditioned)
     change = _inside(problem, result.x, held)
     # Supports and held motion: the balance has a spring to where they are prescribed.
     placed = change._replace(u=change.u + (r.u - inside.u) / problem.typical_stiffness)

@@ -100,9 +100,8 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
     while True:
         mask = None if free is None else jnp.asarray(free, jnp.float32)
         S = S if free is None else S * jnp.asarray(mask_stencil(free), S.dtype)
-        whole = (
-            S if free is None and not levels else apart(with_unit_diagonal, S, scale)
-        )  # a coarse grid may have ghosts
+        # A coarse grid may have ghosts.
+        whole = S if free is None and not levels else apart(with_unit_diagonal, S, scale)
         nodes = S.shape[-3:]
         if not levels:
             finest, lean = whole, jnp.zeros((2, *nodes), S.dtype)

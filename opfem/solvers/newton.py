@@ -213,13 +213,20 @@ def solve_increment(
 
 
 def solve_tangent(
-    problem: Problem, tangent: Tangent, b: Unknowns, held: Array, settings: Newton, transposed: bool = False
+    problem: Problem,
+    tangent: Tangent,
+    b: Unknowns,
+    held: Array,
+    settings: Newton,
+    transposed: bool = False,
+    preconditioned: Unknowns | None = None,
 ) -> KrylovResult:
     """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
 
     In float32, like the tangent. A transposed one is preconditioned from the left: then, too, the Krylov space is
     that of the preconditioned tangent, or its transpose. From the right it would hold moves that press on stiff
-    contact, for which the friction of a transposed tangent is a large force.
+    contact, for which the friction of a transposed tangent is a large force. Where the preconditioned scaled b is
+    known, it is not computed again.
     """
     scale = problem.stress_scale
     b = b.scaled(scale)
@@ -236,10 +243,15 @@ def solve_tangent(
     def precondition(v):
         return inside(tangent.precondition(v))
 
+    start = b
+    if transposed and preconditioned is None:
+        start = precondition(b)
+    elif transposed:
+        start = inside(jax.tree.map(lambda part: (part / size).astype(jnp.float32), preconditioned))
     result = fgmres(
         (lambda v: precondition(multiply(v))) if transposed else multiply,
         (lambda v: v) if transposed else precondition,
-        precondition(b) if transposed else b,
+        start,
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,
         max_iterations=settings.krylov_steps,

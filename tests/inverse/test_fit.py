@@ -255,7 +255,8 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
     def variation(normal):
         return 1e6 * jnp.sum((normal - 3e-3) ** 2)  # kPa²
 
-    @jax.jit  # one program, for values too: each takes minutes to compile
+    # One program, for values too: each takes minutes to compile.
+    @functools.partial(jax.jit, compiler_options=op.compiler_options())
     @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
     def functional(values, length, std):
         moved = eqx.tree_at(lambda m: m.values, thickness, values)

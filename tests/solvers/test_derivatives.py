@@ -124,7 +124,7 @@ CASES["tet10"] = Case(
 CASES["no friction"] = Case(frictional_imprint, {**FRICTIONAL, "window_friction": 0.0, "sample_friction": 0.0})
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=op.compiler_options())
 def forward_and_reverse(
     solve: Callable[[Numbers], op.Solution], numbers: Numbers, direction: Numbers
 ) -> tuple[jax.Array, jax.Array, Numbers]:
@@ -197,7 +197,7 @@ def test_taylor_remainders_fall_with_the_order_of_the_derivatives_taken_away():
     """VALIDATION.md test 37, second derivatives included: halving the step divides remainders by 2, 4 and 8."""
     solve, numbers = CASES["traction on a bonded layer"]
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=op.compiler_options())
     def derivatives(numbers, direction):
         def along(t):
             return measure(solve({name: value + t * direction[name] for name, value in numbers.items()}))
@@ -228,9 +228,11 @@ def test_vmap_over_four_materials_equals_the_loop_and_jit_equals_eager():
         return jax.grad(lambda s: 1e3 * displacement_on_a_spring({**numbers, "shear": s}).pressure.max())(shear)
 
     materials = jnp.array([2e-3, 4e-3, 8e-3, 16e-3])
-    compiled = jax.jit(gradient)
+    compiled = jax.jit(gradient, compiler_options=op.compiler_options())
     loop = [compiled(shear) for shear in materials]
-    np.testing.assert_allclose(jax.jit(jax.vmap(gradient))(materials), loop, 1e-6)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(gradient), compiler_options=op.compiler_options())(materials), loop, 1e-6
+    )
     np.testing.assert_allclose(gradient(materials[1]), loop[1], 1e-6)
 
 
@@ -242,7 +244,7 @@ def test_a_path_too_long_to_record_has_no_derivative():
         solution = displacement_on_a_spring({**numbers, "shear": shear}, op.Newton(increments=3, max_path=2))
         return 1e3 * solution.pressure.mean()
 
-    value, gradient = jax.jit(jax.value_and_grad(mean_pressure))(5.8e-3)
+    value, gradient = jax.jit(jax.value_and_grad(mean_pressure), compiler_options=op.compiler_options())(5.8e-3)
     assert np.isfinite(value)
     assert np.isnan(gradient)
 

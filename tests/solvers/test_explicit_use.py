@@ -35,7 +35,7 @@ def test_gradient_through_two_thousand_increments():
     """By C10 and friction; away from switches, differences of one part in 1e5 see none."""
     evaluate = mean_pressure(2000)
     at = (MATERIAL.c10, 0.15)
-    gradient = jax.jit(jax.grad(evaluate, (0, 1)))(*at)
+    gradient = jax.jit(jax.grad(evaluate, (0, 1)), compiler_options=op.compiler_options())(*at)
     value = jax.jit(evaluate)
     for k in range(2):
         move = np.zeros(2)

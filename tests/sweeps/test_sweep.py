@@ -11,7 +11,7 @@ import xarray as xr
 
 import opfem as op
 from opfem.solvers.progress import Progress
-from opfem.sweep.progress import SweepProgress
+from opfem.sweeps.progress import SweepProgress
 from tests.tolerances import ROUNDOFF
 
 MODES = ("map", "vmap", "call")
