@@ -78,10 +78,10 @@ def coarse_alone(volume: op.OctVolume, edge: str) -> np.ndarray:
     return kept[0]
 
 
-def table(seeds: int) -> None:
+def table(seeds: int, first: int, last: int) -> None:
     x, y = np.meshgrid(DX * np.arange(SIDE), DX * np.arange(SIDE))
     cases = [(c, snr, slope, None) for c, snr in CASES for slope in SLOPES] + [(15, 25, 0.03, 25.0)]
-    for contrast, snr, slope, specular in cases:
+    for contrast, snr, slope, specular in cases[first:last]:
         surface = waves(slope)
         truth = surface(x, y)
         found, simple = [], {}
@@ -184,20 +184,19 @@ def simulator() -> None:
 
 
 def speckled_file(shape: tuple[int, int, int], path: Path) -> None:
-    """Write a raw float32 volume in dB, of independent speckle that is blurred along depth, row by row."""
+    """Write a raw float32 volume in dB, of speckle that is correlated along depth; it repeats every 32 rows."""
     ny, nx, nz = shape
     rng = np.random.default_rng(0)
     x = DX * np.arange(nx)
+    fields = [gaussian_filter1d(rng.standard_normal((2, nx, nz), np.float32), 1.87, axis=2) for _ in range(32)]
+    fields = [field / field.std() for field in fields]
     with open(path, "wb") as file:
         for row in range(ny):
             depth = waves(0.16)(x, DX * row)
             away = 2.5e-3 * np.arange(nz, dtype=np.float32) - depth[:, None].astype(np.float32)
             mean = np.where(away > 0, np.exp(-6.0 * np.maximum(away, 0)), 0.03).astype(np.float32)
-            field = np.sqrt(mean) * (rng.standard_normal((2, nx, nz), dtype=np.float32))
-            field = gaussian_filter1d(field, 1.87, axis=2) * np.float32(2.57) + np.float32(0.05) * rng.standard_normal(
-                (2, nx, nz), dtype=np.float32
-            )
-            file.write((10 * np.log10(field[0] ** 2 + field[1] ** 2)).astype("<f4").tobytes())
+            real, imaginary = np.sqrt(mean) * fields[row % 32] + np.float32(0.05) * fields[(row + 16) % 32][:, ::-1]
+            file.write((10 * np.log10(real**2 + imaginary**2)).astype("<f4").tobytes())
 
 
 CHILD = """
@@ -235,7 +234,9 @@ def speed(shape: tuple[int, int, int], path: Path, edge: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     kinds = parser.add_subparsers(dest="what", required=True)
-    kinds.add_parser("table").add_argument("--seeds", type=int, default=3)
+    accuracy = kinds.add_parser("table")
+    accuracy.add_argument("--seeds", type=int, default=3)
+    accuracy.add_argument("--cases", type=int, nargs=2, default=(0, 99), metavar=("FIRST", "LAST"))
     kinds.add_parser("simulator")
     fast = kinds.add_parser("speed")
     fast.add_argument("shape", type=int, nargs=3)
@@ -243,7 +244,7 @@ def main() -> None:
     fast.add_argument("--edge", default="auto")
     chosen = parser.parse_args()
     if chosen.what == "table":
-        table(chosen.seeds)
+        table(chosen.seeds, *chosen.cases)
     elif chosen.what == "simulator":
         simulator()
     else:

@@ -1,7 +1,7 @@
 """Artefact lines at constant depth: autocorrelation, outer faces of the window, a camera's fixed pattern.
 
-First step of `find_interface`. Lines are what a grey opening removes of the median depth profile of every quarter of
-the map: an interface that slopes is elsewhere in another quarter. The mean B-scan is
+First step of `find_interface`. Lines are what a grey opening removes of the median depth profiles of a map's tiles,
+at one depth in all of them: an interface is flat to a micrometre hardly ever. The mean B-scan is
 never subtracted: over a flat layer the interface itself is constant in depth, and would go with it.
 """
 
@@ -13,7 +13,8 @@ from scipy.ndimage import binary_dilation, grey_opening, label
 
 _WIDTH = 4.0  # axial FWHM: what is narrower is a line; an edge is a step, which an opening keeps
 _ABOVE = 1.3  # times the profile without lines: twice the scatter of a median over 100 A-lines
-_SPREAD = 0.5  # axial FWHM that the maxima of a line in the quarters of a map lie apart at most
+_TILES = 6  # along each side of a map
+_SPREAD = 0.12  # axial FWHM: standard deviation from tile to tile above which a peak is no line but an interface
 _FLOOR = 0.05  # of the profile without lines, which what is left of a line is kept above
 _PROFILES = 20_000  # A-lines that the profile is the median of: its scatter is then 1 %
 
@@ -42,7 +43,7 @@ def profile_lattice(shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def find_lines(power: Float[np.ndarray, "rows columns nz"], fwhm: float) -> DepthLines | None:
-    """Find artefact lines in the median depth profiles of the quarters of a map.
+    """Find artefact lines in the median depth profiles of the tiles of a map.
 
     Args:
         power: Linear power of A-lines from all over the volume.
@@ -51,18 +52,20 @@ def find_lines(power: Float[np.ndarray, "rows columns nz"], fwhm: float) -> Dept
     Returns:
         The lines; None where there are none.
     """
-    halves = np.array_split(power, min(2, power.shape[0]), axis=0)
-    quarters = [quarter for half in halves for quarter in np.array_split(half, min(2, half.shape[1]), axis=1)]
-    profiles = np.stack([np.median(quarter, axis=(0, 1)) for quarter in quarters])
+    tiles = [
+        tile
+        for rows in np.array_split(power, min(_TILES, power.shape[0]), axis=0)
+        for tile in np.array_split(rows, min(_TILES, rows.shape[1]), axis=1)
+    ]
+    profiles = np.stack([np.median(tile, axis=(0, 1)) for tile in tiles])
     bases = grey_opening(profiles, size=(1, max(3, round(_WIDTH * fwhm))), mode="nearest")
-    excess = np.min(profiles - _ABOVE * bases, axis=0)
+    excess = np.median(profiles - _ABOVE * bases, axis=0)
     runs = np.asarray(label(excess > 0)[0])  # pyright: ignore[reportIndexIssue]
     for run in range(1, runs.max() + 1):
-        inside = binary_dilation(runs == run, iterations=max(1, round(fwhm)))
-        tops = np.argmax(np.where(inside, profiles, 0.0), axis=1)
-        if np.ptp(tops) > _SPREAD * fwhm:
+        near = binary_dilation(runs == run, iterations=max(1, round(fwhm)))
+        if _scatter(np.where(near, np.maximum(profiles - bases, 0.0), 0.0)) > _SPREAD * fwhm:
             excess[runs == run] = 0.0
-    profile, base = profiles.mean(axis=0), bases.mean(axis=0)
+    profile, base = np.median(profiles, axis=0), np.median(bases, axis=0)
     if not (excess > 0).any():
         return None
     is_line = binary_dilation(excess > 0, iterations=max(1, round(fwhm)))
@@ -72,6 +75,13 @@ def find_lines(power: Float[np.ndarray, "rows columns nz"], fwhm: float) -> Dept
         (_FLOOR * base).astype(np.float32),
         is_line,
     )
+
+
+def _scatter(heights: Float[np.ndarray, "tiles nz"]) -> float:
+    """Robust standard deviation of the centroids of a peak in several profiles [samples]."""
+    weight = heights.sum(axis=1)
+    centroids = (heights @ np.arange(heights.shape[1]))[weight > 0] / weight[weight > 0]
+    return 1.4826 * float(np.median(np.abs(centroids - np.median(centroids)))) if centroids.size else 0.0
 
 
 def without_lines(power: Float[np.ndarray, "*shape nz"], lines: DepthLines | None) -> Float[np.ndarray, "*shape nz"]:
