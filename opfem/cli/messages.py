@@ -28,10 +28,11 @@ _FIELDS = {
     "smoothed.fwhm": "--smooth",
 }
 _OWNERS = (
-    "Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness"
+    "find_interface|OctVolume|OctSystem|Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness"
 )
 _ARGUMENTS = (
     "unit|extent|spacing|std|variable|missing|mask|scale|elements|element|sides|bulk|c10|c01|increments|duration|"
+    "depth_spacing|index_applied|optical_spacing|shape|order|dtype|edge|search|average|max_slope|confidence|window|"
     "mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws"
 )
 _FIELD = re.compile("|".join(map(re.escape, _FIELDS)) + rf"|\b(?:{_OWNERS})\.({_ARGUMENTS})\b")
