@@ -3,6 +3,7 @@
 Run `python -m benchmarks.oct table [--seeds 3]` for bias, rms, outliers and z-scores by contrast, noise and slope, and
 for a detector that takes the largest gradient of each A-line, the same without outliers (Hampel) and median filtered,
 and the coarse path of semi-global matching without a fit; `simulator` for what the simulated speckle should be;
+`loop` for a known pressure, its volume in a file, and the pressure of the map found in it;
 `speed NY NX NZ [--file PATH]` for time and memory of a fresh process, on a volume made before and removed after.
 Prints one JSON line per case.
 """
@@ -232,6 +233,56 @@ def speed(shape: tuple[int, int, int], path: Path, edge: str) -> None:
         path.unlink(missing_ok=True)
 
 
+def coin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Compute the pressure of a disc with a ridge [MPa]."""
+    disc = 1 / (1 + np.exp((np.hypot(x - 1.0, y - 1.0) - 0.55) / 0.08))
+    return 2e-3 + 2.5e-3 * disc + 2e-3 * disc * np.exp(-(((x - 1.0) / 0.2) ** 2))
+
+
+def loop() -> None:
+    """Go from a known pressure to a volume in a file, and back to the pressure by `Imprint` and by the fit."""
+    side, lines = 2.0, 128
+    palpation = op.Palpation(
+        op.Layer(0.5, op.MooneyRivlin(2.23e-3, 7.03e-4, 0.11732)), (side, side), (16, 16, 4),
+        window=op.Contact(op.HardOverclosure(), 0.15),
+        sample=op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.05),
+    )  # fmt: skip
+    nodes = np.meshgrid(*2 * [np.linspace(0.0, side, 17)])
+    truth = coin(*nodes)
+    scene = op.oct_scene(op.solve(palpation, op.Traction(truth)))
+    step = side / (lines - 1)
+    x, y = np.meshgrid(*2 * [step * np.arange(lines)])
+    exact = op.ThicknessMap(np.asarray(scene.surface.sample(x, y)), extent=(side, side))
+    path = Path("oct_loop.oct")
+    try:
+        volume = op.simulate_oct(
+            op.UWA_845NM, scene.surface, key=jax.random.key(2), spacing=(step, step), shape=(lines, lines), depth=0.6,
+            media=(op.Medium(-15.0, 0.5), op.SAMPLE),
+        )  # fmt: skip
+        op.write_oct(volume, path)
+        found = op.thickness_from_oct(op.read_oct(path), op.UWA_845NM)
+    finally:
+        path.unlink(missing_ok=True)
+    error = np.asarray(found.values) - np.asarray(exact.values)
+    pressures = [op.solve(palpation, op.Imprint(each.smoothed(side / 32))).pressure for each in (found, exact)]
+    row = {
+        "map_rms_um": np.sqrt(np.mean(error**2)) / UM,
+        "imprint_difference": float(np.linalg.norm(pressures[0] - pressures[1]) / np.linalg.norm(pressures[1])),
+    }
+    prior = op.Matern(length=0.3, std=1.5e-3, mean=3.5e-3)
+    first = op.fit_traction(palpation, found, prior, draws=2)
+    model_std = float(np.sqrt(np.mean(op.mesh_error(first.solution) ** 2)))
+    for name, std in (("", 0.0), ("_with_model_std", model_std)):
+        fit = op.fit_traction(palpation, found, prior, model_std=std, draws=32)
+        score = (np.asarray(fit.normal) - truth) / np.asarray(fit.normal_std)
+        row |= {
+            f"inside_95{name}": float(np.mean(np.abs(score) < 1.96)),
+            f"chi2{name}": float(fit.reduced_chi2),
+            f"fit_difference{name}": float(np.linalg.norm(fit.normal - truth) / np.linalg.norm(truth)),
+        }
+    print(json.dumps({**row, "model_std_um": model_std / UM}))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     kinds = parser.add_subparsers(dest="what", required=True)
@@ -239,6 +290,7 @@ def main() -> None:
     accuracy.add_argument("--seeds", type=int, default=3)
     accuracy.add_argument("--cases", type=int, nargs=2, default=(0, 99), metavar=("FIRST", "LAST"))
     kinds.add_parser("simulator")
+    kinds.add_parser("loop")
     fast = kinds.add_parser("speed")
     fast.add_argument("shape", type=int, nargs=3)
     fast.add_argument("--file", type=Path, default=Path("oct_speed.raw"))
@@ -248,6 +300,10 @@ def main() -> None:
         table(chosen.seeds, *chosen.cases)
     elif chosen.what == "simulator":
         simulator()
+    elif chosen.what == "loop":
+        jax.config.update("jax_enable_x64", True)
+        op.cache_compilation()
+        loop()
     else:
         speed(tuple(chosen.shape), chosen.file, chosen.edge)
 

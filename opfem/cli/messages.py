@@ -28,7 +28,8 @@ _FIELDS = {
     "smoothed.fwhm": "--smooth",
 }
 _OWNERS = (
-    "find_interface|OctVolume|OctSystem|Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness"
+    "Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness|"
+    "find_interface|OctVolume|OctSystem"
 )
 _ARGUMENTS = (
     "unit|extent|spacing|std|variable|missing|mask|scale|elements|element|sides|bulk|c10|c01|increments|duration|"

@@ -274,22 +274,23 @@ def _write_hdf5(volume: OctVolume, path: Path) -> None:
     part = "<f8" if wide else "<f4"
     kind = np.dtype([("real", part), ("imag", part)]) if is_complex else np.dtype(values.dtype)
     steps = [[s.name, {key: np.asarray(value).tolist() for key, value in s.numbers.items()}] for s in volume.steps]
-    with h5py.File(path, "w") as file:
+    # From this version on HDF5 keeps checksums, which tell a damaged file.
+    with h5py.File(path, "w", libver=("v108", "v110")) as file:
         data = file.create_dataset("values", volume.shape, kind)
         for row in range(volume.shape[0]):
             block = np.ascontiguousarray(values[row])
             data[row] = block.view(kind) if is_complex else block
         data.attrs.update(
             {
-                "format": _FORMAT,
-                "scale": volume.scale,
+                "format": np.bytes_(_FORMAT),
+                "scale": np.bytes_(volume.scale),
                 "spacing": np.asarray(volume.spacing),
                 "origin": np.asarray(volume.origin),
                 "optical_spacing": float(volume.optical_spacing),
                 "depth_origin": float(volume.depth_origin),
                 "wavelength": 0.0 if volume.wavelength is None else float(volume.wavelength),
                 "phase_sign": volume.phase_sign or 0,
-                "steps": json.dumps(steps),
+                "steps": np.bytes_(json.dumps(steps)),
             }
         )
 

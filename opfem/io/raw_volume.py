@@ -17,6 +17,12 @@ import tifffile
 from ..measurement import MeasurementError
 from .thorlabs import LARGEST_UNPACKED
 
+OWN_ATTRIBUTES = (
+    "format", "scale", "spacing", "origin", "optical_spacing", "depth_origin", "wavelength", "phase_sign", "steps",
+)  # fmt: skip
+"""What `write_oct` states of a volume in HDF5."""
+
+_LARGEST_ATTRIBUTE = 2**16  # bytes; HDF5 keeps no larger ones with their data set
 _COMPLEX = (np.dtype([("real", "<f4"), ("imag", "<f4")]), np.dtype([("real", "<f8"), ("imag", "<f8")]))
 
 
@@ -70,7 +76,7 @@ def read_hdf5(path: Path, variable: str | None) -> Stored:
             kind = np.dtype("<c8" if kind == _COMPLEX[0] else "<c16")
         if kind.kind not in "fiuc":
             raise MeasurementError(f"{name} must hold numbers, got {data.dtype}.")
-        attributes = {key: value for key, value in data.attrs.items() if np.size(value) < 10_000}
+        attributes = {name: data.attrs[name] for name in OWN_ATTRIBUTES if _is_short(data, name)}
         offset = data.id.get_offset()
         if offset is not None and data.chunks is None and not data.external:
             end = offset + math.prod(data.shape) * kind.itemsize
@@ -79,6 +85,14 @@ def read_hdf5(path: Path, variable: str | None) -> Stored:
             return Stored(np.memmap(path, kind, "r", offset, data.shape), attributes)
         _check_memory(name, math.prod(data.shape) * kind.itemsize)
         return Stored(np.ascontiguousarray(data[()]).view(kind), attributes)
+
+
+def _is_short(data: h5py.Dataset, name: str) -> bool:
+    """Tell whether an attribute is there and of fixed length: HDF5 reads damaged texts of variable length for ever."""
+    if name not in data.attrs:
+        return False
+    kind = data.attrs.get_id(name)
+    return kind.dtype.kind in "fiuS" and math.prod(kind.shape) * kind.dtype.itemsize < _LARGEST_ATTRIBUTE
 
 
 def read_mat5(path: Path, variable: str | None) -> Stored:

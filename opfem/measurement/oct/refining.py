@@ -24,7 +24,6 @@ _HALF_WINDOW = 0.06  # mm above and below the edge that levels are fitted to
 _REACH = 0.02  # mm that the edge is looked for away from the coarse surface
 _TRUNCATE = 3.5  # standard deviations that the lateral average reaches
 _SHADE = 0.1  # of the power of its region, which an A-line in a shadow has less of
-_LEAST_STD = 0.04  # samples: what model and interpolation miss of a bright peak, 0.1 µm
 _NEAREST, _REGION = 0.35, 8.0  # widths of the lateral average that an A-line's power and its region's are taken over
 _SELECTION = 3.0  # widths of the lateral average that models are compared over
 # Standard deviations [mm] of the edge about the surface that profiles are flattened along, for the start of a fit and
@@ -273,7 +272,7 @@ def _chosen(fits: list[EdgeFit], models: tuple[str, ...], geometry: Geometry, fl
     noisy = _SURFACE_NOISE[sum(width > 0 for width in geometry.average)]
     correlated = looks_along_depth(geometry.axial, round(_HALF_WINDOW / geometry.dz))
     variance = fit.dispersion * np.clip(texture, 0.6, 4.0) * correlated * noisy
-    variance = variance / (geometry.looks * np.maximum(fit.information, 1e-12)) + _LEAST_STD**2
+    variance = variance / (geometry.looks * np.maximum(fit.information, 1e-12))
     model = np.array([MODELS.index(name) for name in models])[choice]
     with np.errstate(divide="ignore"):
         contrast = 10.0 * np.log10((fit.below + np.where(model == 1, fit.peak, 0.0)) / fit.above)
