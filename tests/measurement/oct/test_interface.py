@@ -10,7 +10,13 @@ UM = 1e-3
 
 
 @pytest.mark.parametrize(
-    ("contrast", "snr", "bias", "rms"), [(15, 25, 0.4, 1.0), (10, 10, 0.4, 1.5), (6, 20, 0.4, 1.9), (3, 20, 0.5, 3.2)]
+    ("contrast", "snr", "bias", "rms"),
+    [
+        (15, 25, 0.4, 1.0),
+        pytest.param(10, 10, 0.4, 1.5, marks=pytest.mark.slow),
+        pytest.param(6, 20, 0.4, 1.9, marks=pytest.mark.slow),
+        (3, 20, 0.5, 3.2),
+    ],
 )
 def test_accuracy_and_its_std(contrast, snr, bias, rms):
     surface = waves(0.16)
@@ -23,7 +29,7 @@ def test_accuracy_and_its_std(contrast, snr, bias, rms):
     assert np.asarray(found.mask).mean() < 0.02
 
 
-@pytest.mark.parametrize("slope", [0.47, 0.6])
+@pytest.mark.parametrize("slope", [pytest.param(0.47, marks=pytest.mark.slow), 0.6])
 def test_steep_surface(slope):
     surface = waves(slope)
     found = op.find_interface(simulated(surface), op.UWA_845NM, edge="brighter")
@@ -163,6 +169,7 @@ def test_depth_counts_from_the_zero_delay():
     np.testing.assert_allclose(part.depth, whole.depth, atol=0.1 * UM)
 
 
+@pytest.mark.slow
 def test_blocks_of_scans_change_nothing():
     volume = simulated(waves(0.3))
     one, other = (op.find_interface(volume, op.UWA_845NM, block_rows=rows) for rows in (96, 20))
