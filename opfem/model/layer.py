@@ -32,8 +32,8 @@ class Layer(eqx.Module):
                     f"Layer.thickness [mm] must be a number or a ThicknessMap, got an array of shape "
                     f"{np.shape(thickness)}. Pass ThicknessMap(values, extent=(Lx, Ly))."
                 )
+            thickness = as_leaf(thickness, "Layer.thickness", "mm")
             check_positive("Layer.thickness", "mm", thickness)
-            thickness = as_leaf(thickness)
         self.thickness = thickness
         self.material = material
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_finite, check_non_negative, concrete
+from .._checks import Leaf, check_finite, check_non_negative, concrete
 from ..measurement import ThicknessMap
 from .surface import INTERPOLATIONS, Interpolation
 
@@ -64,9 +64,9 @@ class Traction(eqx.Module):
         ValueError: If a value is not finite, a shape is wrong, or the stiffness is negative.
     """
 
-    normal: Array = eqx.field(converter=as_leaf)
-    lateral: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
-    stiffness: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    normal: Array = eqx.field(converter=Leaf("Traction.normal", "MPa"))
+    lateral: Array | None = eqx.field(converter=Leaf("Traction.lateral", "MPa", optional=True), default=None)
+    stiffness: Array | None = eqx.field(converter=Leaf("Traction.stiffness", "MPa/mm", optional=True), default=None)
 
     def __check_init__(self):
         check_finite("Traction.normal", "MPa", self.normal)
@@ -94,7 +94,7 @@ class Displacement(eqx.Module):
         ValueError: If a value is not finite, a shape is wrong, or `lateral` is unknown.
     """
 
-    uz: Array = eqx.field(converter=as_leaf)
+    uz: Array = eqx.field(converter=Leaf("Displacement.uz", "mm"))
     lateral: Literal["free", "fixed"] = eqx.field(static=True, default="free")
 
     def __check_init__(self):

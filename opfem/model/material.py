@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_modulus, check_positive
+from .._checks import Leaf, check_finite, check_modulus, check_positive
 from .deformation import (
     Kinematics,
     ProductSum,
@@ -22,14 +22,10 @@ from .deformation import (
 
 
 class AbstractMaterial(eqx.Module):
-    """An isotropic law; `bulk` is its bulk modulus [MPa]."""
+    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa]."""
 
+    shear: eqx.AbstractVar[Array]
     bulk: eqx.AbstractVar[Array]
-
-    @property
-    def shear(self) -> Array:
-        """Initial shear modulus [MPa]."""
-        raise NotImplementedError
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""
@@ -147,9 +143,9 @@ class MooneyRivlin(AbstractInvariantMaterial):
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    c01: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("MooneyRivlin.c10", "MPa"))
+    c01: Array = eqx.field(converter=Leaf("MooneyRivlin.c01", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("MooneyRivlin.bulk", "MPa"))
 
     def __check_init__(self):
         check_finite("MooneyRivlin.c10", "MPa", self.c10)
@@ -168,9 +164,9 @@ class MooneyRivlin(AbstractInvariantMaterial):
 
 
 class NeoHooke(AbstractInvariantMaterial):
-    """Neo-Hooke: ψ = (shear/2)(Ī1 - 3) + (bulk/2)(J - 1)², with Ī1 = J^(-2/3) I1.
+    """Neo-Hooke: ψ = c10 (Ī1 - 3) + (bulk/2)(J - 1)², with Ī1 = J^(-2/3) I1.
 
-    Abaqus: *HYPERELASTIC, NEO HOOKE with C10 = shear/2 and D1 = 2/bulk.
+    Abaqus: *HYPERELASTIC, NEO HOOKE with C10 = c10 and D1 = 2/bulk. Initial shear modulus 2 c10.
 
     Args:
         c10: Half the initial shear modulus [MPa], positive.
@@ -180,8 +176,8 @@ class NeoHooke(AbstractInvariantMaterial):
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("NeoHooke.c10", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("NeoHooke.bulk", "MPa"))
 
     def __check_init__(self):
         check_positive("NeoHooke.c10", "MPa", self.c10)
@@ -211,10 +207,10 @@ class Yeoh(AbstractInvariantMaterial):
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    c20: Array = eqx.field(converter=as_leaf)
-    c30: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("Yeoh.c10", "MPa"))
+    c20: Array = eqx.field(converter=Leaf("Yeoh.c20", "MPa"))
+    c30: Array = eqx.field(converter=Leaf("Yeoh.c30", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("Yeoh.bulk", "MPa"))
 
     def __check_init__(self):
         check_positive("Yeoh.c10", "MPa", self.c10)

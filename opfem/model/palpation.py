@@ -68,7 +68,8 @@ class Palpation(eqx.Module):
             raise ValueError(f"Palpation.layer must be a Layer, got {type(layer).__name__}.")
         if np.shape(extent) != (2,):
             raise ValueError(f"Palpation.extent [mm] must be (Lx, Ly), got {extent!r}.")
-        check_positive("Palpation.extent", "mm", jnp.asarray(extent))
+        extent = as_leaf(extent, "Palpation.extent", "mm")
+        check_positive("Palpation.extent", "mm", extent)
         counts = tuple(int(n) for n in elements)
         if len(counts) != 3 or min(counts) < 1 or counts != tuple(elements):
             raise ValueError(f"Palpation.elements must be three whole numbers (nx, ny, nz) ≥ 1, got {elements!r}.")
@@ -87,16 +88,17 @@ class Palpation(eqx.Module):
                 f"Palpation.element={element!r} needs a finite bulk modulus [MPa], got {bulk}. For an incompressible "
                 'layer pass element="hybrid".'
             )
+        hold = None if hold is None else as_leaf(hold, "Palpation.hold", "N/mm")
         if hold is not None:
             check_positive("Palpation.hold", "N/mm", hold)
         self.layer = layer
-        self.extent = as_leaf(jnp.asarray(extent))
+        self.extent = extent
         self.elements = counts
         self.window = window
         self.sample = sample
         self.sides = _sides(sides)
         self.element = element
-        self.hold = None if hold is None else as_leaf(hold)
+        self.hold = hold
 
     def mesh(self) -> LayerMesh:
         """Build the mesh, with the layer's thickness sampled at its nodes."""

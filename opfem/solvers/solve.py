@@ -1,5 +1,7 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -57,13 +59,13 @@ def solve(
         check_compatible(palpation, load, None if start is None else start.load)
         solution = solve_explicit(palpation, load, solver, start, progress)
         return _raise_on_failure(solution, is_traced(solution)) if throw else solution
-    require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
     first = None if start is None else start.last_converged.state
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
+    require_float64("Newton", palpation=palpation, load=load, start=first, solver=solver)
     traced = is_traced((palpation, load, load_start, first, solver))
     run = _run_differentiable if traced else _run_with_progress
     with Progress(progress and not traced) as bar:
@@ -193,11 +195,15 @@ def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
     return solution
 
 
-def require_float64(palpation: Palpation) -> None:
-    """Raise ValueError where numbers are float32."""
-    dtypes = {leaf.dtype for leaf in jax.tree.leaves(palpation) if eqx.is_inexact_array(leaf)}
-    if jnp.dtype("float32") in dtypes:
-        raise ValueError(
-            "Newton needs float64 numbers, got float32. Before building the layer, run "
-            'jax.config.update("jax_enable_x64", True) once.'
-        )
+def require_float64(caller: str, **inputs: Any) -> None:
+    """Raise ValueError where numbers are not float64: the first such input, by its name, and what to do."""
+    for name, part in inputs.items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+            if not eqx.is_inexact_array(leaf) or leaf.dtype == jnp.dtype("float64"):
+                continue
+            if jnp.zeros((), float).dtype == jnp.dtype("float64"):
+                advice = "It was made while jax_enable_x64 was off, or cast since; build it again."
+            else:
+                advice = 'Before building the layer, run jax.config.update("jax_enable_x64", True) once.'
+            place = ".".join([name, jax.tree_util.keystr(path, simple=True, separator=".")]).removesuffix(".")
+            raise ValueError(f"{caller} needs float64 numbers, got {leaf.dtype} in {place}. {advice}")

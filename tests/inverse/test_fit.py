@@ -458,7 +458,7 @@ def looked_along(misfit):
 
     rtol, number = jnp.asarray(1e-2), jnp.asarray
     descent = PreconditionedDescent(lambda J: lambda g: g, rtol, number(60), number(0.03), number(jnp.inf))
-    solver = GaussNewton(rtol, rtol, descent)
+    solver = GaussNewton(rtol, descent)
     state = solver.init(followed, y := jnp.zeros(3), None, {}, *jax.eval_shape(followed, y, None), frozenset())
     for _ in range(6):
         y, state, _ = solver.step(followed, y, None, {}, state, frozenset())
