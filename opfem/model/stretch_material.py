@@ -14,11 +14,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import Leaf, check_finite, check_modulus, check_positive, concrete
 from .deformation import Kinematics, ProductSum, Tensor, identity_like, product, transpose
-from .material import AbstractMaterial
+from .material import AbstractMaterial, LogStrain, Numbers, on_diagonal
 
 _SWEEPS = 6  # of Jacobi's method on 3×3: it converges quadratically, and five reach rounding
 
@@ -43,6 +44,11 @@ class AbstractStretchMaterial(AbstractMaterial):
     def divided_difference(self, start: Array, step: Array) -> Array:
         """Compute (w'(start + step) - w'(start)) / step [MPa] without cancellation; w'' at step 0."""
         raise NotImplementedError
+
+    def log_stiffness(self, strain: LogStrain) -> Float[Numbers, "3 3 *points"]:
+        """Compute d²ψ/dε_a dε_b [MPa] by principal log strains, at constant volume."""
+        xp = np if isinstance(strain, np.ndarray) else jnp
+        return on_diagonal(xp.asarray(self.curvature(jnp.asarray(strain))))
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""
@@ -80,7 +86,8 @@ class Ogden(AbstractStretchMaterial):
     Σ mu_p. Where a source writes ψ = Σ_p m_p/alpha_p (Σ_a λ_a^alpha_p - 3), mu_p = m_p alpha_p / 2.
 
     Args:
-        mu: Moduli of the terms [MPa], `(terms,)`; their sum is positive.
+        mu: Moduli of the terms [MPa], `(terms,)`; their sum is positive. Where one is negative the law may be stable up
+            to some stretch only: see `MooneyRivlin`.
         alpha: Exponents of the terms [-], `(terms,)`, none zero.
         bulk: Bulk modulus [MPa], positive.
 

@@ -44,6 +44,9 @@ STATS = {
     "approach": ("mm", "approach of sample and layer that the contact law itself causes"),
     "max_penetration": ("mm", "largest penetration"),
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
+    "min_stretch": ("1", "smallest principal stretch in the layer, volume change taken out"),
+    "max_stretch": ("1", "largest principal stretch in the layer, volume change taken out"),
+    "unstable_stretch": ("1", "stretch reached from which on the material law is unstable, 0: none"),
     "increment": ("s", "shortest time increment"),
     "kinetic_ratio": ("1", "largest kinetic over all energy after the first tenth of the load"),
     "energy_drift": ("1", "largest energy missing from the balance over all energy"),
@@ -123,7 +126,11 @@ def status_name(solution: Solution) -> str:
 
 def status_message(solution: Solution) -> str:
     """Say in words how a solve ended; empty when all is well."""
-    return RESULTS[solution.result]
+    message = RESULTS[solution.result]
+    if status_name(solution) == "material_unstable":
+        low, high, limit = (float(solution.stats[f"{name}_stretch"]) for name in ("min", "max", "unstable"))
+        message += f" Stretches reach from {low:.3g} to {high:.3g}; from {limit:.3g} on it is unstable."
+    return message
 
 
 def _require_one(solution: Solution) -> None:

@@ -346,6 +346,7 @@ def _finish(
         "increment": jnp.nanmin(history.increment),
         "kinetic_ratio": history.kinetic_ratio,
         "energy_drift": history.drift,
+        **fields.stretches,
         "output_time": history.time,
         "output_increment": history.increment,
         **{f"energy_{name}": values for name, values in history.energies.items()},

@@ -15,7 +15,7 @@ from ..mechanics.face import (
     to_corners,
     tributary_area,
 )
-from ..model import Imprint, Load
+from ..model import Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State
 from .solution import OPEN, SLIP, STICK, FaceResult
 
@@ -31,6 +31,7 @@ class Fields(eqx.Module):
     window: FaceResult
     thickness: ThicknessMap
     stress_zz: Float[Array, "ny nx"]
+    stretches: dict[str, Array]
     stats: dict[str, Array]
 
 
@@ -63,7 +64,13 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         "min_volume_ratio": forces.smallest_J,
     }
     top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
-    return Fields(sample, window, deformed_thickness(problem, u, load), top, stats)
+    return Fields(sample, window, deformed_thickness(problem, u, load), top, reached_stretches(problem, u), stats)
+
+
+def reached_stretches(problem: Problem, u: Array) -> dict[str, Array]:
+    """Find the smallest and the largest principal stretch in the layer."""
+    smallest, largest = extreme_stretches(problem.body.kinematics(u))
+    return {"min_stretch": smallest, "max_stretch": largest}
 
 
 def _face(

@@ -16,7 +16,7 @@ from .explicit import Explicit, solve_explicit
 from .newton import Newton
 from .progress import Progress
 from .recover import recover
-from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure
+from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure, judged
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
 # Compiling takes as long whatever the mesh.
@@ -49,7 +49,9 @@ def solve(
         `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
         the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N mm] about the origin,
         `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
-        `max_penetration` [mm], `min_volume_ratio` [-].
+        `max_penetration` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
+        stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
+        law is unstable, 0 if it was stable as far as it was stretched).
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.
@@ -57,7 +59,7 @@ def solve(
     """
     if isinstance(solver, Explicit):
         check_compatible(palpation, load, None if start is None else start.load)
-        solution = solve_explicit(palpation, load, solver, start, progress)
+        solution = judged(solve_explicit(palpation, load, solver, start, progress))
         return _raise_on_failure(solution, is_traced(solution)) if throw else solution
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
@@ -76,7 +78,7 @@ def solve(
         if getattr(load, "correct_approach", False):
             problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, bar)
         bar.stage("fields")
-        solution = finish(problem, stepping, palpation, load)
+        solution = judged(finish(problem, stepping, palpation, load))
     return _raise_on_failure(solution, traced) if throw else solution
 
 
@@ -163,6 +165,7 @@ def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> S
         "attempts": s.attempts,
         "residual": s.residual,
         "load_fraction": s.state.fraction,
+        **fields.stretches,
     }
 
     def kept(field):
@@ -191,7 +194,11 @@ def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
         return solution.result.error_if(solution, failed)
     if bool(failed):
         reached = float(solution.last_converged.load_fraction)
-        raise ConvergenceError(f"The solve stopped at {reached:.1%} of the load. {RESULTS[solution.result]}", solution)
+        message = f"The solve stopped at {reached:.1%} of the load. {RESULTS[solution.result]}"
+        unstable = float(solution.stats["unstable_stretch"])
+        if unstable:
+            message += f" The material law loses stability at a stretch of {unstable:.3g}, which elements had reached."
+        raise ConvergenceError(message, solution)
     return solution
 
 
