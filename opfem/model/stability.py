@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .deformation import Kinematics, inverse_cube_root
+from .deformation import Kinematics
 from .material import AbstractMaterial
 
 # Exponents of the stretch in each mode: uniaxial, equibiaxial, planar; all at constant volume.
@@ -31,12 +31,14 @@ def extreme_stretches(k: Kinematics) -> tuple[Float[Array, ""], Float[Array, ""]
         k: Of the field.
     """
     k = jax.lax.stop_gradient(k)
-    j = inverse_cube_root(k.J) ** 2
+    j = k.J ** (-2.0 / 3.0)
     mean, I2 = j * k.I1 / 3.0, j * j * k.I2
     radius = jnp.sqrt(jnp.maximum(mean**2 - I2 / 3.0, jnp.finfo(mean.dtype).tiny ** 0.5))
     angle = jnp.arccos(jnp.clip((2.0 * mean**3 - mean * I2 + 1.0) / (2.0 * radius**3), -1.0, 1.0)) / 3.0
     smallest, largest = (mean + 2.0 * radius * jnp.cos(angle + shift) for shift in (2.0 * np.pi / 3.0, 0.0))
-    return jnp.sqrt(jnp.maximum(jnp.min(smallest), 0.0)), jnp.sqrt(jnp.max(largest))
+    # One reduction for both: each would be a program of its own.
+    ends = jnp.max(jnp.stack([-smallest, largest]).reshape(2, -1), axis=1)
+    return jnp.sqrt(jnp.maximum(-ends[0], 0.0)), jnp.sqrt(ends[1])
 
 
 def unstable_stretch(material: AbstractMaterial, smallest: Any, largest: Any) -> Array:

@@ -240,7 +240,7 @@ def _pressure_image(
     lateral = np.asarray(solution.displacement[:2, -1])
     if not np.isfinite(lateral).all():
         return np.full(x.shape, np.nan)
-    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)[0]
+    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)
 
 
 def _fit(fit: TractionFit) -> dict[str, Variable]:

@@ -48,7 +48,7 @@ def recover_motion(dynamics: Dynamics, m: Motion, load: Load) -> Fields:
     return Fields(
         _face(dynamics, "sample", m.sample, u, sample),
         _face(dynamics, "window", m.window, u, window),
-        deformed_thickness(problem, u, load),
+        deformed_thickness(problem.positions[:, -1], u[:, -1], load),
         top,
         reached_stretches(problem, u),
         stats,
