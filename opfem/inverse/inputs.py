@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._checks import concrete
 from ..measurement import ThicknessMap
 from ..model import Contact, Palpation
+from ..model.plausible import check_against_layer
 from .data import AxialDisplacement
 from .noise import noise_std
 from .observation import Observation
@@ -64,6 +65,8 @@ def check_inputs(
             f"fit_traction.thickness must be one map, or several on one grid of pixels, got shapes "
             f"{[m.shape for m in maps]}."
         )
+    for m in maps:
+        check_against_layer("fit_traction.thickness", m, palpation.layer.thickness, palpation.extent)
     check_parameters(palpation, parameters)
     nx, ny, nz = palpation.elements
     if min(nx, ny) < 4:

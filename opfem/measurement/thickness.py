@@ -9,9 +9,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import wadler_lindig as wl
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_non_negative, check_positive, concrete
+from .._repr import quantity
 from .._types import Map, Mask, Pair, Points, Scalar, ScalarLike
 from .checks import check_grid, check_map_shape, check_mask, check_std, check_thickness
 from .filtering import WHITE_NOISE_LENGTH, smooth, smoothed_variance
@@ -129,6 +131,20 @@ class ThicknessMap(eqx.Module):
         check_non_negative("ThicknessMap.noise_length", "mm", self.noise_length)
         if self.std is not None:
             check_std(self.std, self.mask, shape)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        del options
+        values, mask = concrete(self.values), concrete(self.mask)
+        if values is None or mask is None or values.ndim != 2 or mask.all():
+            return None  # traced or stacked: as equinox writes it
+        low, high = values[~mask].min(), values[~mask].max()
+        span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+        parts = [f"{values.shape[1]} × {values.shape[0]} pixels", f"{span} mm"]
+        for name in ("extent", "origin", "std", "noise_length"):
+            part = getattr(self, name)
+            parts += [] if part is None or not np.any(part) else [f"{name} {quantity(part, 'mm')}"]
+        parts += [f"{mask.sum()} missing{' and filled' if self.is_filled else ''}"] if mask.any() else []
+        return wl.TextDoc(f"ThicknessMap({', '.join(parts)})")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -1,10 +1,13 @@
 """What holds a face of the layer: bonded, roller, or contact with Coulomb friction."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._checks import Leaf, check_non_negative, check_positive
+from .._repr import with_units
 from .overclosure import AbstractOverclosure
 
 # Abaqus's default slip tolerance: elastic slip over element size.
@@ -51,6 +54,9 @@ class Contact(eqx.Module):
             check_positive("Contact.elastic_slip", "mm", self.elastic_slip)
         if self.stick_slope is not None:
             check_positive("Contact.stick_slope", "MPa/mm", self.stick_slope)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def slip_limit(self, pressure: Array, element_size: Array) -> Array:
         """Compute the elastic slip [mm] at which a point starts to slide."""

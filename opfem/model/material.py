@@ -4,12 +4,15 @@ Stress and tangent are closed forms; `energy` is the oracle that tests different
 in the modified invariants; those in principal stretches are in `stretch_material`.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import Leaf, check_finite, check_modulus, check_positive
+from .._repr import with_units
 from .deformation import (
     Kinematics,
     ProductSum,
@@ -20,6 +23,7 @@ from .deformation import (
     product,
     transpose,
 )
+from .plausible import check_modulus_unit
 
 Numbers = Array | np.ndarray
 """On the device, or on the host (`stability`)."""
@@ -31,6 +35,12 @@ class AbstractMaterial(eqx.Module):
 
     shear: eqx.AbstractVar[Array]
     bulk: eqx.AbstractVar[Array]
+
+    def __check_init__(self):
+        check_modulus_unit(f"{type(self).__name__} shear modulus", self.shear)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""

@@ -5,7 +5,7 @@ Every law is finite, with a finite slope, for any clearance.
 """
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._checks import Leaf, check_finite, check_positive, concrete
+from .._repr import with_units
+from .plausible import check_clearance_unit, check_modulus_unit
 
 # Overclosure, in units of c0, beyond which the exponential law continues along its tangent;
 # the same threshold as Abaqus (Theory Guide 5.2.1). At p0 = 2 MPa it is 1.3 GPa.
@@ -29,6 +31,9 @@ class AbstractOverclosure(eqx.Module):
     """
 
     exact: ClassVar[bool] = False
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
@@ -150,6 +155,8 @@ class ExponentialOverclosure(AbstractOverclosure):
     def __check_init__(self):
         check_positive("ExponentialOverclosure.pressure (p0)", "MPa", self.pressure)
         check_positive("ExponentialOverclosure.clearance (c0)", "mm", self.clearance)
+        check_modulus_unit("ExponentialOverclosure.pressure (p0)", self.pressure)
+        check_clearance_unit("ExponentialOverclosure.clearance (c0)", self.clearance)
 
     def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
@@ -211,6 +218,8 @@ class TabularOverclosure(AbstractOverclosure):
                 f"TabularOverclosure.clearance [mm] must fall from row to row, got {clearances.tolist()}. "
                 "Overclosure is minus the clearance."
             )
+        check_modulus_unit("TabularOverclosure.pressure", self.pressure)
+        check_clearance_unit("TabularOverclosure.clearance", self.clearance)
 
     def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""

@@ -1,7 +1,7 @@
 """The experiment: a layer between window and sample, its field, its mesh and its sides."""
 
 from collections.abc import Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_positive, concrete
+from .._repr import with_units
 from .contact import Bonded, Contact, Roller, Side
 from .layer import Layer
 from .mesh import LayerMesh
@@ -45,13 +46,13 @@ class Palpation(eqx.Module):
     """
 
     layer: Layer
-    extent: Float[Array, "2"]
+    extent: Float[Array, "2"] = eqx.field(metadata={"unit": "mm"})
     elements: tuple[int, int, int] = eqx.field(static=True)
     window: Side
     sample: Side
     sides: tuple[str, str, str, str] = eqx.field(static=True)
     element: Element = eqx.field(static=True)
-    hold: Array | None
+    hold: Array | None = eqx.field(metadata={"unit": "N/mm"})
 
     def __init__(
         self,
@@ -99,6 +100,9 @@ class Palpation(eqx.Module):
         self.sides = _sides(sides)
         self.element = element
         self.hold = hold
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def mesh(self) -> LayerMesh:
         """Build the mesh, with the layer's thickness sampled at its nodes."""

@@ -15,6 +15,7 @@ from .._checks import concrete
 from ..inverse import FitStatus, TractionFit
 from ..model import Imprint
 from ..solvers import CONVERGED, RESULTS, FaceResult, Solution
+from ..solvers.solution import OPEN, is_failure
 from .fields import under_pixels
 from .interior import layer_fields
 from .provenance import describe, inputs_hash, steps_as_json, versions
@@ -130,7 +131,18 @@ def status_message(solution: Solution) -> str:
     if status_name(solution) == "material_unstable":
         low, high, limit = (float(solution.stats[f"{name}_stretch"]) for name in ("min", "max", "unstable"))
         message += f" Stretches reach from {low:.3g} to {high:.3g}; from {limit:.3g} on it is unstable."
+    elif touches_nowhere(solution):
+        message = (
+            "Nothing touches: the layer is unloaded, and every pressure is zero. Is the map thicker than L0, or in "
+            "another unit?"
+        )
     return message
+
+
+def touches_nowhere(solution: Solution) -> bool:
+    """Tell whether an imprint has reached its full depth without contact anywhere."""
+    imprinted = isinstance(solution.load, Imprint) and not bool(is_failure(solution.result))
+    return imprinted and not np.any(np.asarray(solution.contact_status) != OPEN)
 
 
 def _require_one(solution: Solution) -> None:
