@@ -89,7 +89,7 @@ def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: Abstra
         ValueError: If the map's std is missing or not positive.
     """
     std = noise_std("linear_estimate", thickness)
-    check_against_layer("linear_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent)
+    check_against_layer("linear_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent, 3)
     mesh = palpation.mesh()
     observation = observe(mesh, thickness, std)
     white = solve_linear(palpation, observation, prior).x
@@ -107,7 +107,7 @@ def uniaxial_estimate(palpation: Palpation, thickness: ThicknessMap) -> Nodes:
     Source:
         Kennedy et al., Optics Letters 39 (2014) 3014: the layer's local strain and its stress–strain curve.
     """
-    check_against_layer("uniaxial_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent)
+    check_against_layer("uniaxial_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent, 3)
     mesh = palpation.mesh()
     stretch = thickness.sample(*mesh.plane()) / mesh.thickness
     return -uniaxial_stress(palpation.layer.material, stretch)

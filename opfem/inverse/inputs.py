@@ -66,7 +66,7 @@ def check_inputs(
             f"{[m.shape for m in maps]}."
         )
     for m in maps:
-        check_against_layer("fit_traction.thickness", m, palpation.layer.thickness, palpation.extent)
+        check_against_layer("fit_traction.thickness", m, palpation.layer.thickness, palpation.extent, 4)
     check_parameters(palpation, parameters)
     nx, ny, nz = palpation.elements
     if min(nx, ny) < 4:

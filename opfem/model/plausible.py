@@ -63,7 +63,7 @@ def check_unloaded(thickness: Any) -> None:
         )
 
 
-def check_against_layer(field: str, thickness: ThicknessMap, layer: Any, extent: Any, stacklevel: int = 3) -> None:
+def check_against_layer(field: str, thickness: ThicknessMap, layer: Any, extent: Any, stacklevel: int) -> None:
     """Hold a loaded map against the unloaded thickness of its layer, where numbers are known.
 
     Warns where the sample touches nowhere, or more of the map lies above L0 than a sample lifts off.
@@ -73,7 +73,7 @@ def check_against_layer(field: str, thickness: ThicknessMap, layer: Any, extent:
         thickness: The loaded map.
         layer: Unloaded thickness [mm], a number or a map.
         extent: Lx, Ly of the layer [mm].
-        stacklevel: Whose line the warning names; 3: the caller's caller.
+        stacklevel: Whose line the warning names: 1 is this function, 2 its caller.
 
     Raises:
         ValueError: If map and layer cannot belong together: in different units, most likely.

@@ -152,7 +152,7 @@ def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> No
                 "zero. Pass sample=Roller(), or press the shape in with Imprint."
             )
     if isinstance(load, Imprint):
-        check_against_layer("Imprint.thickness", load.thickness, palpation.layer.thickness, palpation.extent)
+        check_against_layer("Imprint.thickness", load.thickness, palpation.layer.thickness, palpation.extent, 4)
 
 
 def _supports(palpation: Palpation, load: Load) -> Supports:

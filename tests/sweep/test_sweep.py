@@ -10,7 +10,9 @@ import pytest
 import xarray as xr
 
 import opfem as op
+from opfem.solvers import CONVERGED
 from opfem.solvers.progress import Progress
+from opfem.sweep.outputs import GOOD
 from opfem.sweep.progress import SweepProgress
 from tests.tolerances import ROUNDOFF
 
@@ -28,6 +30,10 @@ def same(a: xr.Dataset, b: xr.Dataset) -> bool:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("size", [1, 4, 6, 100])
+def test_a_solve_that_kept_its_fields_has_a_result_in_a_sweep():
+    assert set(GOOD) == set(CONVERGED)
+
+
 def test_a_table_holds_what_the_loop_gives(mode, size):
     data = op.sweep(work, AXES, execution=op.Batch(size, mode))
     assert data.work.dims == ("force", "distance")
