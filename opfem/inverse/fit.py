@@ -210,7 +210,8 @@ class _Run:
             jnp.asarray(_CG_NEGLIGIBLE),
             jnp.asarray(misfit.hopeless),
         )
-        gauss_newton = GaussNewton(rtol=jnp.asarray(self.rtol), descent=descent)
+        # `atol` is a property, which optimistix declares as an argument.
+        gauss_newton = GaussNewton(rtol=jnp.asarray(self.rtol), descent=descent)  # pyright: ignore[reportCallIssue]
         state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):

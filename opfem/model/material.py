@@ -4,7 +4,7 @@ Stress and tangent are closed forms; `energy` is the oracle that tests different
 in the modified invariants; those in principal stretches are in `stretch_material`.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,10 +31,15 @@ LogStrain = Float[Numbers, "3 *points"]
 
 
 class AbstractMaterial(eqx.Module):
-    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa]."""
+    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa], each a field or a property."""
 
-    shear: eqx.AbstractVar[Array]
     bulk: eqx.AbstractVar[Array]
+    if TYPE_CHECKING:  # as an abstract field it would count as an argument of laws whose shear modulus is a property
+
+        @property
+        def shear(self) -> Array:
+            """Initial shear modulus [MPa]."""
+            ...
 
     def __check_init__(self):
         check_modulus_unit(f"{type(self).__name__} shear modulus", self.shear)
@@ -98,11 +103,11 @@ class AbstractInvariantMaterial(AbstractMaterial):
         Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, ch. 6.
     """
 
-    def slopes(self, I1_change: Numbers) -> tuple[Numbers, Numbers]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return dψ/dĪ1 and dψ/dĪ2 [MPa] at Ī1 - 3."""
         raise NotImplementedError
 
-    def curvature(self, I1_change: Numbers) -> Numbers | None:
+    def curvature(self, I1_change: Numbers) -> Any:
         """Return d²ψ/dĪ1² [MPa] at Ī1 - 3; None where it is zero for any stretch."""
         return None
 
@@ -188,7 +193,7 @@ class MooneyRivlin(AbstractInvariantMaterial):
         check_positive("MooneyRivlin shear modulus 2 (c10 + c01)", "MPa", 2.0 * (self.c10 + self.c01))
         check_modulus("MooneyRivlin.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Numbers) -> tuple[Numbers, Numbers]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return c10 and c01 [MPa]."""
         return self.c10, self.c01
 
@@ -218,7 +223,7 @@ class NeoHooke(AbstractInvariantMaterial):
         check_positive("NeoHooke.c10", "MPa", self.c10)
         check_modulus("NeoHooke.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Numbers) -> tuple[Numbers, Numbers]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return c10 and zero [MPa]."""
         return self.c10, jnp.zeros_like(self.c10)
 
@@ -253,11 +258,11 @@ class Yeoh(AbstractInvariantMaterial):
         check_finite("Yeoh.c30", "MPa", self.c30)
         check_modulus("Yeoh.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Numbers) -> tuple[Numbers, Numbers]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return dψ/dĪ1 and zero [MPa] at Ī1 - 3."""
         return self.c10 + (2.0 * self.c20 + 3.0 * self.c30 * I1_change) * I1_change, jnp.zeros_like(self.c10)
 
-    def curvature(self, I1_change: Numbers) -> Numbers:
+    def curvature(self, I1_change: Numbers) -> Any:
         """Return d²ψ/dĪ1² [MPa] at Ī1 - 3."""
         return 2.0 * self.c20 + 6.0 * self.c30 * I1_change
 

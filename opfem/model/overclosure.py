@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import Leaf, check_finite, check_positive, concrete
+from .._checks import Leaf, as_leaf, check_finite, check_positive, concrete
 from .._repr import with_units
 from .plausible import check_clearance_unit, check_modulus_unit
 
@@ -78,13 +78,13 @@ class HardOverclosure(AbstractOverclosure):
         ValueError: If stiffness_ratio is not positive.
     """
 
-    stiffness_ratio: Array = eqx.field(converter=Leaf("HardOverclosure.stiffness_ratio", "-"))
+    stiffness_ratio: Array
     exact: bool = eqx.field(static=True)
 
     def __init__(self, stiffness_ratio=None, exact: bool = False):
         if stiffness_ratio is None:
             stiffness_ratio = 100.0 if exact else 1000.0
-        self.stiffness_ratio = stiffness_ratio
+        self.stiffness_ratio = as_leaf(stiffness_ratio, "HardOverclosure.stiffness_ratio")
         self.exact = exact
 
     def __check_init__(self):

@@ -128,10 +128,10 @@ def _on_layer(thickness: ThicknessMap, layer: Any, extent: Any) -> tuple[np.ndar
 
 def _known(thickness: ThicknessMap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Take values, mask, x and y of one map whose numbers are known."""
-    parts = [concrete(part) for part in (thickness.values, thickness.mask, thickness.origin, thickness.extent)]
-    if any(part is None for part in parts) or np.ndim(parts[0]) != 2:
+    parts = (thickness.values, thickness.mask, thickness.origin, thickness.extent)
+    values, mask, origin, sides = (concrete(part) for part in parts)
+    if values is None or mask is None or origin is None or sides is None or values.ndim != 2:
         return None
-    values, mask, origin, sides = (np.asarray(part) for part in parts)
     x, y = (origin[k] + sides[k] * np.linspace(0.0, 1.0, values.shape[1 - k]) for k in range(2))
     return values, mask, x, y
 

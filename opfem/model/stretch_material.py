@@ -154,7 +154,7 @@ class Hencky(AbstractStretchMaterial):
         ValueError: If a number is out of its range.
     """
 
-    shear: Array = eqx.field(converter=Leaf("Hencky.shear", "MPa"))
+    shear: Array = eqx.field(converter=Leaf("Hencky.shear", "MPa"))  # pyright: ignore[reportIncompatibleVariableOverride]
     bulk: Array = eqx.field(converter=Leaf("Hencky.bulk", "MPa"))
 
     def __check_init__(self):

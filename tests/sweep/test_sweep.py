@@ -28,12 +28,12 @@ def same(a: xr.Dataset, b: xr.Dataset) -> bool:
     return a.drop_vars("wall_time").drop_attrs().identical(b.drop_vars("wall_time").drop_attrs())
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("size", [1, 4, 6, 100])
 def test_a_solve_that_kept_its_fields_has_a_result_in_a_sweep():
     assert set(GOOD) == set(CONVERGED)
 
 
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [1, 4, 6, 100])
 def test_a_table_holds_what_the_loop_gives(mode, size):
     data = op.sweep(work, AXES, execution=op.Batch(size, mode))
     assert data.work.dims == ("force", "distance")
