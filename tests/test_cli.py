@@ -407,6 +407,7 @@ def test_l0_in_another_unit_is_refused_before_the_solve(tmp_path, map_file, solv
 
 def test_a_warning_is_a_line_of_its_own(capsys):
     with reporting(False):
+        warnings.simplefilter("always")
         for _ in range(2):
             warnings.warn("L0 is in doubt", stacklevel=1)
     assert capsys.readouterr().err == "opfem: L0 is in doubt\n"

@@ -7,6 +7,7 @@ import re
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -200,7 +201,9 @@ def test_errors_say_what_to_do():
     refused("forces needs one for each of 1 maps, got 2", forces=[op.ForceReading(1.0, 0.1)] * 2)
     inside = op.AxialDisplacement(np.zeros((3, 12, 13)), 1e-4)
     refused(r"inside \[mm\].*\(nz\+1, ny\+1, nx\+1\) = \(3, 13, 13\).*got shape \(3, 12, 13\)", inside=inside)
+    jaxtyping.config.update("jaxtyping_disable", True)  # as users run it
     refused(r"inside \[mm\].*got ndarray", inside=[np.zeros((3, 13, 13))])
+    jaxtyping.config.update("jaxtyping_disable", False)
     fits = op.AxialDisplacement(np.zeros((3, 13, 13)), 1e-4)
     refused("inside needs one for each of 1 maps, got 2", inside=[fits, fits])
     beside = op.ThicknessMap(np.full((11, 11), 0.45), extent=(SIDE, SIDE), std=NOISE, origin=(5.0, 0.0))
