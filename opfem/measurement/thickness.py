@@ -142,7 +142,8 @@ class ThicknessMap(eqx.Module):
         parts = [f"{values.shape[1]} × {values.shape[0]} pixels", f"{span} mm"]
         for name in ("extent", "origin", "std", "noise_length"):
             part = getattr(self, name)
-            parts += [] if part is None or not np.any(part) else [f"{name} {quantity(part, 'mm')}"]
+            if part is not None and (concrete(part) is None or np.any(part)):
+                parts.append(f"{name} {quantity(part, 'mm')}")
         parts += [f"{mask.sum()} missing{' and filled' if self.is_filled else ''}"] if mask.any() else []
         return wl.TextDoc(f"ThicknessMap({', '.join(parts)})")
 

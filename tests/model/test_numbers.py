@@ -97,6 +97,17 @@ def test_numbers_stay_traceable():
     assert single.dtype == jnp.float64
 
 
+@pytest.mark.parametrize("kind", ["f2", "f4", ">f4", ">f8", "longdouble"])
+def test_axes_and_settings_take_any_type(kind, annotations_unchecked):
+    data = op.sweep(lambda c10: op.NeoHooke(1e-3 * c10, 5.0).shear, {"c10": np.asarray([NUMBER, 0.5], kind)})
+    np.testing.assert_allclose(data.value, [2e-3 * NUMBER, 1e-3], ROUNDOFF)
+    assert data.c10.dtype == np.float64
+    number = np.asarray(NUMBER, kind)[()]
+    assert op.Newton(rtol=number).as_leaves().rtol.dtype == jnp.float64
+    explicit = op.Explicit(duration=number, safety=number, increment=number)
+    assert {type(v) for v in (explicit.duration, explicit.safety, explicit.increment)} == {float}
+
+
 def test_every_type_solves_to_the_same_map():
     """float32 numbers that float64 holds exactly change nothing; a float32 map by the rounding of its pixels."""
     single, measured = np.float32, bumpy_map()

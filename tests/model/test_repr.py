@@ -59,6 +59,8 @@ def test_traced_and_stacked_numbers_are_written_too():
     assert seen == ["NeoHooke(c10=traced float64[] MPa, bulk=traced float64[] MPa)"]
     many = jax.vmap(lambda c10: op.NeoHooke(c10, 0.1))(1e-3 * jnp.arange(1.0, 4.0))
     assert repr(many) == "NeoHooke(c10=(0.001, 0.002, 0.003) MPa, bulk=(0.1, 0.1, 0.1) MPa)"
+    jax.grad(lambda std: seen.append(repr(op.ThicknessMap(np.full((2, 3), 0.4), extent=EXTENT, std=std))) or std)(0.002)
+    assert "std traced float64[] mm" in seen[-1]
     maps = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), flat_map(0.45))
     assert repr(maps).startswith("ThicknessMap(")
     assert "True" in repr(jax.tree.map(lambda _: True, MATERIAL))
