@@ -41,6 +41,7 @@ def extreme_stretches(k: Kinematics) -> tuple[Float[Array, ""], Float[Array, ""]
     return jnp.sqrt(jnp.maximum(-ends[0], 0.0)), jnp.sqrt(ends[1])
 
 
+@np.errstate(all="ignore")  # of a solve that failed, stretches may be anything
 def unstable_stretch(material: AbstractMaterial, smallest: Any, largest: Any) -> Array:
     """Find the stretch nearest to rest at which a law loses stability, among those reached [-]; 0 where it does not.
 

@@ -1,5 +1,7 @@
 """Drucker's criterion against closed forms, and what a solve says that leaves the stable range."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,6 +107,14 @@ def test_limit_in_closed_form():
 @pytest.mark.parametrize("law", STABLE.values(), ids=STABLE)
 def test_laws_in_use_are_stable_from_a_tenth_to_tenfold(law):
     assert unstable_stretch(law, 0.1, 10.0) == 0
+
+
+@pytest.mark.parametrize(("low", "high"), [(np.nan, np.nan), (0.0, 1e200), (1.0, 1.0), (0.5, np.inf)])
+def test_stretches_of_a_failed_solve_raise_no_alarm(low, high):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for law in STABLE.values():
+            assert unstable_stretch(law, low, high).shape == ()
 
 
 @pytest.mark.parametrize("law", [law for law, _ in LAWS.values()], ids=LAWS)
