@@ -1,11 +1,14 @@
 """`opfem sweep`: from a file to a table, going on, and what is wrong with a file."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import opfem as op
 from opfem import cli
-from opfem.cli.sweep import _inputs, _points, _read
+from opfem.cli.statement import read_maps, state_experiment
+from opfem.cli.sweep import _AXES, _inputs, _points, _read
 from tests.tolerances import SOLVER
 
 CONFIG = """
@@ -73,6 +76,21 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys):
     config.write_text(CONFIG.replace("0.2]", "0.3]"), encoding="utf-8")
     assert opfem("sweep", config, "--out", out, "--resume") == 1
     assert "different inputs: axis window_friction" in capsys.readouterr().err
+
+
+def test_every_axis_is_a_number_of_the_experiment(config):
+    """At two values of each: stated as its option, and put in the place that the axis names."""
+    units = {"MPa": 1e-3, "mm": 0.1, "1": 0.1}
+    for name, axis in _AXES.items():
+        stated = _read(config)
+        stated["inputs"].pop(name, None)
+        points = _points({name: [1.0 * units[axis.unit], 1.5 * units[axis.unit]]}, {})
+        inputs = _inputs(stated["inputs"], points, config.parent)
+        measured, unloaded = read_maps(inputs.map, inputs.reading)
+        palpation, _ = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
+        assert axis.where(palpation) == pytest.approx(units[axis.unit])
+        moved = eqx.tree_at(axis.where, palpation, jnp.asarray(1.5 * units[axis.unit]))
+        assert axis.where(moved) == pytest.approx(1.5 * units[axis.unit])
 
 
 @pytest.mark.parametrize(

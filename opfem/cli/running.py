@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,7 +54,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
 def reporting(debug: bool) -> Iterator[None]:
     """End with a message and an exit status instead of a traceback."""
     try:
-        with _redelivered_interrupts():
+        with _redelivered_interrupts(), _warnings_in_yellow():
             yield
     except KeyboardInterrupt:
         _complain("Interrupted; no file was left half-written.")
@@ -65,6 +66,22 @@ def reporting(debug: bool) -> Iterator[None]:
         unexpected = f"Unexpected {type(cause).__name__}: {cause} (--debug shows where; please report it.)"
         _complain(str(cause) if expected else unexpected)
         raise SystemExit(1) from None
+
+
+@contextmanager
+def _warnings_in_yellow() -> Iterator[None]:
+    """Show warnings as this program says things: in a line of their own, each once, without the line of code."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in said:
+            said.add(str(message))
+            console = Console(stderr=True, highlight=False)
+            console.print(f"opfem: {message}", style="yellow", markup=False, soft_wrap=True)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from .. import sweep as computation
 from ..datasets import coin_file
 from ..model import Palpation
 from ..solvers import Newton, Solution, solve
+from ..solvers.discretise import check_compatible
 from ..solvers.progress import Progress
 from ..sweep import Batch, sample, zip_
 from ..sweep.design import Points, grid, known_name
@@ -263,6 +264,7 @@ def _function(inputs: _Inputs, names: tuple[str, ...]) -> Callable[..., Solution
     """State the experiment as a function of the numbers that vary."""
     measured, unloaded = read_maps(inputs.map, inputs.reading)
     palpation, load = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
+    check_compatible(palpation, load, None)  # inside jit nothing can
     solver = Newton() if inputs.increments is None else Newton(increments=inputs.increments)
 
     def solution(**numbers) -> Solution:
