@@ -29,7 +29,11 @@ from .io import (
     write_thickness as write_thickness,
     write_vtu as write_vtu,
 )
-from .measurement import MeasurementError as MeasurementError, ThicknessMap as ThicknessMap
+from .measurement import (
+    MeasurementError as MeasurementError,
+    MeasurementWarning as MeasurementWarning,
+    ThicknessMap as ThicknessMap,
+)
 from .model import (
     Bonded as Bonded,
     Contact as Contact,

@@ -32,8 +32,8 @@ _OWNERS = (
     "Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness"
 )
 _ARGUMENTS = (
-    "unit|extent|spacing|std|variable|missing|mask|scale|elements|element|sides|bulk|c10|c01|increments|duration|"
-    "mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws"
+    "unit|extent|spacing|std|variable|max_missing|max_bytes|missing|mask|scale|elements|element|sides|bulk|c10|c01|"
+    "increments|duration|mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws"
 )
 _FIELD = re.compile("|".join(map(re.escape, _FIELDS)) + rf"|\b(?:{_OWNERS})\.({_ARGUMENTS})\b")
 _CALL = re.compile(rf"\b(?:{_OWNERS})\(({_ARGUMENTS})=\.\.\.\)")

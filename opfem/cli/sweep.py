@@ -257,7 +257,7 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
         known_name("[inputs]", name, tuple(hints))
         if name in points.columns:
             raise ValueError(f"[inputs] {name} is also one of the [axes]. Leave one out.")
-        if name == "l0" and isinstance(value, int | float) and not isinstance(value, bool):
+        if name in ("l0", "missing") and isinstance(value, int | float) and not isinstance(value, bool):
             value = str(value)
         value = _converted(f"[inputs] {name}", _plain(hints[name]), value)
         given[name] = _path(value, folder) if name in ("l0", "map", "mask") else value
