@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # Arguments and fields of the library, and the options that they come from; others are called as the option is.
 _FIELDS = {
     "Layer.thickness": "--l0",
+    "Imprint.thickness": "MAP",
     "Palpation.extent": "--layer-extent",
     "Contact.friction": "--window-friction or --sample-friction",
     "ExponentialOverclosure.pressure": "--p0",

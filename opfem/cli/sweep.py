@@ -33,7 +33,7 @@ from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions
 from .statement import configure_jax, read_maps, state_experiment, state_palpation
 
 # All that a sweep writes, the mark of a finished one last.
-_RESULT = (POINTS, PLAN, FINISHED)
+RESULT = (POINTS, PLAN, FINISHED)
 # Where a sweep is computed that is to take the place of the one in the folder around it.
 _REPLACEMENT = ".opfem-replacement"
 
@@ -99,7 +99,7 @@ def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
         prepare(out)
         data = compute(function, points, keep=keep, execution=execution, out=folder)
         if folder != out:
-            take_place(out, folder, _RESULT)
+            take_place(out, folder, RESULT)
     failed = int(np.sum(~np.isin(data.status, GOOD)))
     console = Console(highlight=False)
     console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
@@ -133,12 +133,12 @@ def _read(config: Path) -> dict[str, Any]:
 
 def _settle(out: Path, resume: bool, force: bool) -> Path:
     """Find the folder to compute in: an old sweep that is to be replaced stays until the new one is complete."""
-    finish(out, _RESULT)
+    finish(out, RESULT)
     begun, replacement = (out / PLAN).exists(), out / _REPLACEMENT
     if (out / FINISHED).exists() and not begun:
         raise FileExistsError(f"--out {out} holds the result of another command. Choose another --out.")
     if force and begun:
-        refuse_links(out, _RESULT)
+        refuse_links(out, RESULT)
         shutil.rmtree(replacement, ignore_errors=True)
         return replacement
     if resume and (replacement / PLAN).exists():
