@@ -63,6 +63,7 @@ _UNITS = {
 }
 _Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
+_MOST_STATED = 1000  # points that are checked one by one, a millisecond each
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
 
@@ -229,7 +230,8 @@ def _is_log(name: str, axis: Mapping[str, Any]) -> bool:
 def _numbers(name: str, values: Any) -> np.ndarray:
     if not isinstance(values, list):
         raise ValueError(f"[axes] {name} must hold a list of numbers, got {values!r}.")
-    return np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    array = np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    return array if np.isfinite(array).all() else _checked(name, array)  # before numbers are made of infinity
 
 
 def _factor(name: str, axis: Any) -> float:
@@ -346,11 +348,16 @@ def _function(inputs: _Inputs, points: Points) -> Callable[..., Solution]:
 
 
 def _check_points(inputs: _Inputs, palpation: Palpation, points: Points) -> None:
-    """State the experiment at every point, which checks its numbers; inside jit nothing can."""
+    """State the experiment at the points, which checks their numbers; inside jit nothing can.
+
+    Of very many points those at the ends of every axis are stated, where numbers go wrong first, and some between.
+    """
     extent = (float(palpation.extent[0]), float(palpation.extent[1]))
     layers, contacts = (tuple(typing.get_type_hints(group)) for group in (LayerOptions, ImprintOptions))
     seen = set()
-    for i in range(len(points)):
+    chosen = set(np.linspace(0, len(points) - 1, min(len(points), _MOST_STATED)).astype(int).tolist())
+    chosen |= {int(end) for column in points.columns.values() for end in (np.argmin(column), np.argmax(column))}
+    for i in sorted(chosen):
         numbers = {name: float(column[i]) for name, column in points.columns.items()}
         unloaded = numbers.get("l0", palpation.layer.thickness)
         for group in ({"l0", *layers}, set(contacts)):  # independent of each other: each combination once

@@ -105,6 +105,12 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys):
         ('unit = "kPa"', 'unit = ["kPa"]', "[axes] c10 unit must be one of MPa, kPa, Pa, got ['kPa']"),
         ("[0.0, 0.2]", "[0.0, true]", "[axes] window_friction [1] must be a number, got True"),
         ("[0.0, 0.2]", "[0.0, nan]", "[axes] window_friction [1] must be zero or positive, got [0.0, nan]"),
+        ("to = 4.0", "to = 1e999", "[axes] c10 [MPa] must be positive, got [2.0, inf]"),
+        (
+            "to = 4.0, points = 2",
+            "to = nan, points = 2, log = true",
+            "[axes] c10 [MPa] must be positive, got [2.0, nan]",
+        ),
         ("[0.0, 0.2]", "{ values = 0.2 }", "[axes] window_friction must hold a list of numbers, got 0.2"),
         ("smooth = 0.2", 'smooth = "0.2"', "[inputs] smooth must be a number, got '0.2'"),
         ("smooth = 0.2", "smooth = true", "[inputs] smooth must be a number, got True"),
@@ -241,6 +247,28 @@ class TestForce:
     @pytest.fixture
     def map_of(self, config):
         return config.parent / "map.npy"
+
+
+def test_of_many_points_the_ends_and_some_between_are_stated(config, tmp_path, computed, monkeypatch, capsys):
+    seen = []
+
+    def state(unloaded, extent, layer, contact):
+        seen.append(layer.c10)
+        if layer.c10 == 5e-3:
+            raise ValueError("too stiff")
+
+    values = np.linspace(2.0, 4.0, 10_000)
+    values[7] = 5.0  # kPa
+    config.write_text(CONFIG.replace("{ from = 2.0, to = 4.0, points = 2, ", f"{{ values = {values.tolist()}, "))
+    monkeypatch.setattr("opfem.cli.sweep.state_palpation", state)
+    assert opfem("sweep", config, "--out", tmp_path / "out") == 1
+    assert "[axes] at c10 = 0.005: too stiff" in capsys.readouterr().err
+    values[7] = 3.0
+    seen.clear()
+    config.write_text(CONFIG.replace("{ from = 2.0, to = 4.0, points = 2, ", f"{{ values = {values.tolist()}, "))
+    assert opfem("sweep", config, "--out", tmp_path / "out") == 0
+    assert {2e-3, 4e-3} <= set(seen)
+    assert len(seen) < 1100
 
 
 def test_a_file_from_notepad(config, tmp_path, computed):
