@@ -63,7 +63,7 @@ _UNITS = {
 }
 _Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
-_MOST_STATED = 1000  # points that are checked one by one, a millisecond each
+_MOST_STATED = 200  # points that are checked one by one, a millisecond each
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
 
