@@ -27,9 +27,9 @@ import jax
 import numpy as np
 
 import opfem as op
-from opfem.sweep.design import Points
-from opfem.sweep.execution import Program
-from opfem.sweep.outputs import GOOD, Outputs
+from opfem.sweeps.design import Points
+from opfem.sweeps.execution import Program
+from opfem.sweeps.outputs import GOOD, Outputs
 
 KEEP = ("pressure", "newton_steps")
 IMPOSSIBLE = -1e-2  # C10 [MPa]: such a layer has no stable state

@@ -4,93 +4,46 @@ Units are mm, N, MPa, s, tonne; maps are indexed [y, x]; tension is positive and
 pressure is positive in compression.
 """
 
-from typing import Any
-
-from . import datasets as datasets
-from .compilation import cache_compilation as cache_compilation
-from .inverse import (
-    AxialDisplacement as AxialDisplacement,
-    FitError as FitError,
-    FitStatus as FitStatus,
-    ForceReading as ForceReading,
-    LinearEstimate as LinearEstimate,
-    LogNormal as LogNormal,
-    Matern as Matern,
-    Normal as Normal,
-    Tikhonov as Tikhonov,
-    TotalVariation as TotalVariation,
-    TractionFit as TractionFit,
-    fit_traction as fit_traction,
-    linear_estimate as linear_estimate,
-    mesh_error as mesh_error,
-    refitted as refitted,
-    uniaxial_estimate as uniaxial_estimate,
-)
-from .io import (
-    Checkpoint as Checkpoint,
-    read_netcdf as read_netcdf,
-    read_thickness as read_thickness,
-    write_netcdf as write_netcdf,
-    write_pvd as write_pvd,
-    write_thickness as write_thickness,
-    write_vtu as write_vtu,
-)
-from .measurement import MeasurementError as MeasurementError, ThicknessMap as ThicknessMap
-from .model import (
-    Bonded as Bonded,
-    Contact as Contact,
-    Displacement as Displacement,
-    ExponentialOverclosure as ExponentialOverclosure,
-    HardOverclosure as HardOverclosure,
-    Hencky as Hencky,
-    Imprint as Imprint,
-    Layer as Layer,
-    LinearOverclosure as LinearOverclosure,
-    MooneyRivlin as MooneyRivlin,
-    NeoHooke as NeoHooke,
-    Ogden as Ogden,
-    Palpation as Palpation,
-    Roller as Roller,
-    TabularOverclosure as TabularOverclosure,
-    Traction as Traction,
-    Yeoh as Yeoh,
-)
-from .results import layer_fields as layer_fields, summary as summary, to_xarray as to_xarray
-from .solvers import (
-    RESULTS as RESULTS,
-    ConvergenceError as ConvergenceError,
-    Explicit as Explicit,
-    Newton as Newton,
-    Solution as Solution,
-    compiler_options as compiler_options,
-    solve as solve,
-)
-from .sweep import (
-    Batch as Batch,
-    Cluster as Cluster,
-    Devices as Devices,
-    sample as sample,
-    sweep as sweep,
-    value_and_sensitivities as value_and_sensitivities,
-    zip_ as zip_,
-)
-
-_PICTURES = (
-    "plot_fit",
-    "plot_layer",
-    "plot_pressure",
-    "plot_report",
-    "plot_residual",
-    "plot_status",
-    "plot_thickness",
-    "plot_uncertainty",
-)
+# What takes time is imported in the functions: `opfem --help` and Ctrl-C do not wait for it.
+import functools
 
 
-def __getattr__(name: str) -> Any:
-    """Load pictures when one is asked for: they bring matplotlib and pyvista."""
-    if name in _PICTURES:
-        from . import plot
+@functools.cache
+def _homes() -> dict[str, str]:
+    """Read which module holds each public name from `__init__.pyi`, the one list of them."""
+    import ast
+    from pathlib import Path
 
-        return getattr(plot, name)
-    raise AttributeError(f"module 'opfem' has no attribute {name!r}")
+    stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    lines = [line for line in stub.body if isinstance(line, ast.ImportFrom)]
+    return {alias.name: f".{line.module or alias.name}" for line in lines for alias in line.names}
+
+
+def __getattr__(name: str) -> object:
+    """Load what a name needs when it is first asked for: JAX takes half a second, pictures one more."""
+    from importlib import import_module
+
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("opfem")
+    if name == "__all__":
+        return __dir__()
+    unknown = AttributeError(f"module 'opfem' has no attribute {name!r}")
+    if name.startswith("_"):
+        raise unknown
+    home = _homes().get(name, f".{name}")
+    try:
+        module = import_module(home, __name__)
+    except ModuleNotFoundError as cause:
+        if cause.name != __name__ + home:
+            raise
+        raise unknown from None
+    value = module if home == f".{name}" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted([*_homes(), "__version__"])

@@ -24,14 +24,16 @@ MAY_IMPORT |= {
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},
     "datasets": {"datasets", "io", "measurement"},
-    "sweep": {"sweep", "io", "compilation", *CHAIN},
+    "sweeps": {"sweeps", "io", "compilation", *CHAIN},
 }
-SEE_ALL = {"__init__", "cli"}
+SEE_ALL = {"__init__", "__main__", "cli"}
 
 LIBRARY_HOMES = {
-    "xarray": {"results", "io", "sweep", "plot", "cli"},
+    "xarray": {"results", "io", "sweeps", "plot", "cli"},
     "h5py": {"io"},
     "scipy.io": {"io"},
+    "tifffile": {"io"},
+    "PIL": {"io"},
     "pyvista": {"io", "plot"},
     "vtk": {"io", "plot"},
     "matplotlib": {"plot"},
@@ -208,16 +210,52 @@ def test_name_is_not_used(name):
     assert located([p for p in MODULES if name in names_used(p)]) == []
 
 
+ALL_BUT_PICTURES = "import opfem; [getattr(opfem, name) for name in dir(opfem) if not name.startswith('plot')]; "
+
+
+def run(code: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def test_import_loads_only_what_is_asked_for():
+    found = "print(*sorted({'jax', 'numpy', 'xarray', 'opfem.model'} & set(sys.modules)))"
+    assert run(f"import sys, opfem, opfem.cli; {found}") == ""
+    assert run(f"import sys, opfem; opfem.Layer; {found}") == "jax numpy opfem.model"
+
+
 def test_import_loads_no_plotting_library():
-    code = "import sys, opfem; print(*sorted({'matplotlib', 'pyvista', 'vtk', 'vtkmodules'} & set(sys.modules)))"
-    answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == ""
+    found = "print(*sorted({'matplotlib', 'pyvista', 'vtk', 'vtkmodules'} & set(sys.modules)))"
+    assert run(f"import sys; {ALL_BUT_PICTURES} {found}") == ""
 
 
 def test_import_leaves_jax_configuration_alone():
-    code = "import jax; before = jax.config.jax_enable_x64; import opfem; print(before == jax.config.jax_enable_x64)"
-    answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "True"
+    compare = "print(before == jax.config.jax_enable_x64)"
+    assert run(f"import jax; before = jax.config.jax_enable_x64; {ALL_BUT_PICTURES} {compare}") == "True"
+
+
+def test_public_names_are_listed_and_there():
+    import opfem
+
+    names = dir(opfem)
+    assert {"Layer", "solve", "sweep", "plot_pressure", "datasets", "__version__"} <= set(names)
+    assert all(getattr(opfem, name) is not None for name in names)
+    assert callable(opfem.sweep)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = opfem.nothing
+    assert (PACKAGE / "py.typed").is_file()
+
+
+def test_options_of_the_command_line_are_those_of_the_library():
+    """The command line states them again, so that its help need not load JAX."""
+    from typing import get_args
+
+    from opfem.cli import options
+    from opfem.model.palpation import ELEMENTS
+
+    assert get_args(options.Element) == ELEMENTS
+    assert set(get_args(options.Hexahedron)) == {name for name in ELEMENTS if not name.startswith("tet")}
 
 
 class TestRules:

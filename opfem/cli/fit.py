@@ -3,10 +3,9 @@
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax.numpy as jnp
-from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
@@ -16,80 +15,75 @@ from ..model import Contact, MooneyRivlin, Palpation
 from ..results import summary, to_xarray
 from ..solvers import Newton
 from ..solvers.progress import Progress
-from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions
-from .running import FINISHED, app, configure_jax, prepare, refuse_finished, reporting, write_files
-from .statement import read_maps, settings_of, show_assumptions, state_experiment
+from .folder import prepare, settle, write_result
+from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions, StepOptions
+from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
-FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", FINISHED)
 _ELEMENTS_PER_LENGTH = 3.0
 
 
-@app.command
 def fit(
-    map: Annotated[str, Parameter(name="MAP")],
-    /,
-    *,
+    map: str,
     out: Path,
-    reading: MapOptions = MapOptions(),
-    layer: LayerOptions = LayerOptions(),
-    contact: ContactOptions = ContactOptions(),
-    asked: FitOptions = FitOptions(),
-    run: RunOptions = RunOptions(),
+    reading: MapOptions,
+    layer: LayerOptions,
+    contact: ContactOptions,
+    asked: FitOptions,
+    steps: StepOptions,
+    run: RunOptions,
 ) -> None:
-    """Fit the traction on the sample to a measured thickness map, with its uncertainty.
-
-    Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
-    summary.json, pressure.png and fit.png.
+    """Fit the traction on the sample to a measured thickness map and write it.
 
     Args:
-        map: Loaded thickness (.mat, .npy, .npz, .tif, .csv), or the word `example` for a built-in one.
+        map: File of the loaded thickness, or `example`.
         out: Folder of the results.
         reading: How to read the maps.
         layer: The layer and its mesh.
         contact: Contact with window and sample.
         asked: The fit.
+        steps: How the load is applied.
         run: The run itself.
     """
-    with reporting(run.debug):
-        with Progress(True, at_once=True) as progress:
-            progress.stage("reading")
-            configure_jax(run.no_cache)
-            refuse_finished(out, run.force)
-            if run.solver != "newton":
-                raise ValueError("opfem fit differentiates the implicit solver; leave out --solver explicit.")
-            measured, unloaded = read_maps(map, reading)
-            palpation, load = state_experiment(measured, unloaded, reading, layer, contact)
-            prior = state_prior(palpation, load.thickness, asked)
-            settings = {**settings_of(map, reading, layer, contact, load), **_asked(asked, prior)}
-            prepare(out)
-            show_assumptions(palpation, measured, layer, contact)
-            Console(highlight=False).print(
-                f"  prior: pressure {1e3 * settings['prior_mean']:.3g} ± {1e3 * settings['prior_std']:.3g} kPa, "
-                f"correlated over {settings['prior_length']:.3g} mm; noise of the map as given"
+    with Progress(True, at_once=True) as progress:
+        progress.stage("reading")
+        configure_jax(run.no_cache)
+        settle(out, run.force)
+        measured, unloaded = read_maps(map, reading)
+        if measured.std is None:
+            raise ValueError("--std [mm] is needed: the standard deviation of the thickness noise, a positive number.")
+        palpation, filled = state_experiment(measured, unloaded, reading, layer, contact)
+        prior = state_prior(palpation, filled, asked)
+        settings = {**settings_of(map, reading, layer, contact, filled), **_asked(asked, prior)}
+        prepare(out)
+        show_assumptions(palpation, measured, layer, contact)
+        Console(highlight=False).print(
+            f"  prior: pressure {1e3 * settings['prior_mean']:.3g} ± {1e3 * settings['prior_std']:.3g} kPa, "
+            f"correlated over {settings['prior_length']:.3g} mm; noise of the map as given"
+        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=UserWarning, module=r"opfem\.")  # shown with the results
+            fitted = fit_traction(
+                palpation,
+                measured,
+                prior,
+                parameters=_parameters(palpation, asked),
+                nonnegative=asked.nonnegative,
+                model_std=asked.model_std,
+                hyperparameters=asked.hyperparameters,
+                solver=Newton(max_path=12) if steps.increments is None else Newton(increments=steps.increments),
+                draws=asked.draws,
             )
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", category=UserWarning, module=r"opfem\.")  # shown with the results
-                fitted = fit_traction(
-                    palpation,
-                    measured,
-                    prior,
-                    parameters=_parameters(palpation, asked),
-                    nonnegative=asked.nonnegative,
-                    model_std=asked.model_std,
-                    hyperparameters=asked.hyperparameters,
-                    solver=Newton(max_path=12) if run.increments is None else Newton(increments=run.increments),
-                    draws=asked.draws,
-                )
-            progress.stage("pictures")
-            numbers = fit_summary(fitted)
-            # Loaded here, so that the help and a refused run do not wait for matplotlib.
-            from ..plot import draw_fit
+        progress.stage("pictures")
+        numbers = fit_summary(fitted)
+        # Loaded here, so that a refused run does not wait for matplotlib.
+        from ..plot import draw_fit
 
-            dataset = to_xarray(fitted)
-            figures = draw_fit(dataset, measured)
-            progress.stage("writing")
-            write_files(dataset, figures, {**numbers, "settings": settings}, FILES, out)
-        _show(numbers, out)
+        dataset = to_xarray(fitted)
+        figures = draw_fit(dataset, measured)
+        progress.stage("writing")
+        example = measured if map == "example" else None
+        files = write_result(dataset, figures, {**numbers, "settings": settings}, out, example)
+    _show(numbers, files, out)
 
 
 def state_prior(palpation: Palpation, filled: ThicknessMap, asked: FitOptions) -> Matern:
@@ -159,7 +153,7 @@ def _asked(asked: FitOptions, prior: Matern) -> dict[str, Any]:
     return {**dataclasses.asdict(asked), **{f"prior_{name}": value for name, value in used.items()}}
 
 
-def _show(numbers: dict[str, Any], out: Path) -> None:
+def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
     rows = [
         ("force on the layer, normal", f"{-numbers['force_sample_N'][2]:.4g}", "N"),
         ("mean pressure", f"{numbers['pressure_mean_kPa']:.3g}", "kPa"),
@@ -191,4 +185,4 @@ def _show(numbers: dict[str, Any], out: Path) -> None:
         console.print(f"The data tell {name} to {100 * part:.0f} % only.", style="yellow")
     for name, (after, before) in numbers["not_observed"].items():
         console.print(f"The map hardly tells: {name} ({after:.3g} after, {before:.3g} before the fit).", style="yellow")
-    console.print(f"Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)
+    console.print(f"Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)

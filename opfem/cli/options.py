@@ -1,4 +1,4 @@
-"""Options of the command line, in the groups that its help shows."""
+"""Options of the command line, in the groups that its help shows; loads nothing that takes time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,13 +6,15 @@ from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
 
-from ..model.palpation import Element
+from .quantities import NewFile, NumberOrFile, OldFile, Quantity, count, not_negative, positive, whole
 
 # The layer of the published decks; bulk is what Abaqus/Explicit makes of their D=0, K/µ = 20.
 PUBLISHED_C10, PUBLISHED_C01, PUBLISHED_BULK = 2.23e-3, 7.03e-4, 0.11732
 _ELEMENTS = (40, 40, 4)
 
-NoCache = Annotated[bool, Parameter(help="Compile anew and keep nothing, as with OPFEM_NO_CACHE=1 in the environment.")]
+Hexahedron = Literal["mean_dilatation", "full", "reduced", "hybrid"]
+# As in `model.palpation`, which would load JAX.
+Element = Literal["mean_dilatation", "full", "reduced", "hybrid", "tet4", "tet10"]
 
 
 @Parameter(name="*", group=Group("Map", sort_key=1))
@@ -20,18 +22,77 @@ NoCache = Annotated[bool, Parameter(help="Compile anew and keep nothing, as with
 class MapOptions:
     """How to read the loaded and the unloaded thickness."""
 
-    l0: Annotated[str | None, Parameter(help="Unloaded thickness: a number in mm, or the path of a map.")] = None
-    extent: Annotated[
-        tuple[float, float] | None, Parameter(help="LX LY from the first to the last sample in mm; this or --spacing.")
+    l0: Annotated[
+        str | None,
+        Parameter(
+            help="Unloaded thickness: a number in mm, or the path of a map.", validator=NumberOrFile("mm", "a map")
+        ),
     ] = None
-    spacing: Annotated[float | None, Parameter(help="Distance between samples in mm, the same in x and y.")] = None
+    extent: Annotated[
+        tuple[float, float] | None,
+        Parameter(
+            help="LX LY from the first to the last sample in mm; this or --spacing.",
+            validator=positive("mm", "two positive numbers"),
+        ),
+    ] = None
+    spacing: Annotated[
+        tuple[float, ...] | None,
+        Parameter(
+            help="DX DY between samples in mm, or one number for both; this or --extent.",
+            consume_multiple=True,
+            validator=positive("mm", "one positive number, or two"),
+        ),
+    ] = None
     unit: Annotated[Literal["mm", "um", "µm", "m"], Parameter(help="Unit of the file's numbers.")] = "mm"
-    std: Annotated[float | None, Parameter(help="Standard deviation of the thickness noise in mm.")] = None
-    variable: Annotated[str | None, Parameter(help="Name of the array, where MAP holds several.")] = None
+    scale: Annotated[
+        float | None,
+        Parameter(
+            help="Thickness of one count in µm, for files of counts; instead of --unit.", validator=positive("µm")
+        ),
+    ] = None
+    missing: Annotated[
+        str | None,
+        Parameter(
+            help="Numbers that mark missing pixels in the files, as in 0,65535; none if odd numbers are thickness.",
+            allow_leading_hyphen=True,
+        ),
+    ] = None
+    mask: Annotated[
+        str | None,
+        Parameter(
+            help="Image or array of the pixels of MAP that are no data: 0 is data, all else is not.",
+            validator=OldFile("an image or array"),
+        ),
+    ] = None
+    max_missing: Annotated[
+        float,
+        Parameter(
+            help="Largest fraction of missing pixels to accept.",
+            validator=Quantity("1", "a number from 0 to 1", 0.0, 1.0),
+        ),
+    ] = 0.5
+    std: Annotated[
+        float | None,
+        Parameter(help="Standard deviation of the thickness noise in mm.", validator=positive("mm")),
+    ] = None
+    variable: Annotated[
+        str | None, Parameter(help="Name of the array, where MAP holds several; as in scan.thickness.")
+    ] = None
     l0_variable: Annotated[str | None, Parameter(help="The same in the file of --l0.")] = None
+    max_bytes: Annotated[
+        int | None,
+        Parameter(
+            help="Largest array to load; a compressed one may be far larger than its file. Default: 512 MiB.",
+            validator=Quantity("bytes", "a whole number of at least 1", 1.0),
+            converter=whole,
+        ),
+    ] = None
     smooth: Annotated[
         float | None,
-        Parameter(help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element."),
+        Parameter(
+            help="FWHM in mm of the Gaussian that smooths the maps; 0 is none. Default: half an element.",
+            validator=not_negative("mm"),
+        ),
     ] = None
 
 
@@ -41,28 +102,56 @@ class LayerOptions:
     """The layer and its mesh."""
 
     c10: Annotated[
-        float | None, Parameter(help=f"Mooney–Rivlin C10 in MPa. Default: the published {PUBLISHED_C10}.")
+        float | None,
+        Parameter(
+            help=f"Mooney–Rivlin C10 in MPa. Default: the published {PUBLISHED_C10}.",
+            validator=Quantity("MPa", "a number"),
+        ),
     ] = None
     c01: Annotated[
-        float | None, Parameter(help=f"Mooney–Rivlin C01 in MPa. Default: the published {PUBLISHED_C01}.")
+        float | None,
+        Parameter(
+            help=f"Mooney–Rivlin C01 in MPa. Default: the published {PUBLISHED_C01}.",
+            validator=Quantity("MPa", "a number"),
+        ),
     ] = None
     bulk: Annotated[
         float | None,
         Parameter(
             help="Bulk modulus in MPa, or inf (incompressible: with --element hybrid); required with --c10 or --c01. "
-            f"Default: {PUBLISHED_BULK}, K/µ = 20."
+            f"Default: {PUBLISHED_BULK}, K/µ = 20.",
+            validator=positive("MPa", "a positive number, or inf", infinite=True),
         ),
     ] = None
     layer_extent: Annotated[
-        tuple[float, float] | None, Parameter(help="LX LY of the layer in mm, where it is not the map's.")
+        tuple[float, float] | None,
+        Parameter(
+            help="LX LY of the layer in mm, where it is not the map's.",
+            validator=positive("mm", "two positive numbers"),
+        ),
     ] = None
-    elements: Annotated[tuple[int, int, int], Parameter(help="Elements along x, y and through the thickness.")] = (
-        _ELEMENTS
-    )
+    elements: Annotated[
+        tuple[int, int, int],
+        Parameter(
+            help="Elements along x, y and through the thickness.",
+            validator=count("three whole numbers of at least 1"),
+            converter=whole,
+        ),
+    ] = _ELEMENTS
     element: Annotated[Element, Parameter(help="Element: see Palpation; hybrid for a nearly incompressible layer.")] = (
         "mean_dilatation"
     )
     sides: Annotated[Literal["free", "roller"], Parameter(help="What the layer's sides meet.")] = "free"
+
+
+@Parameter(name="*", group=Group("Layer", sort_key=2))
+@dataclass(frozen=True)
+class FitLayerOptions(LayerOptions):
+    """The layer and its mesh, of what a fit can differentiate."""
+
+    element: Annotated[
+        Hexahedron, Parameter(help="Element: see Palpation; hybrid for a nearly incompressible layer.")
+    ] = "mean_dilatation"
 
 
 @Parameter(name="*", group=Group("Contact", sort_key=3))
@@ -70,10 +159,25 @@ class LayerOptions:
 class ContactOptions:
     """Contact with window and sample."""
 
-    window_friction: Annotated[float, Parameter(help="Coulomb friction at the window.")] = 0.15
-    sample_friction: Annotated[float, Parameter(help="Coulomb friction at the sample.")] = 0.05
-    p0: Annotated[float, Parameter(help="Sample contact: pressure at zero clearance in MPa.")] = 2.0
-    c0: Annotated[float, Parameter(help="Sample contact: clearance where pressure starts in mm.")] = 0.01
+    window_friction: Annotated[
+        float, Parameter(help="Coulomb friction at the window.", validator=not_negative("1"))
+    ] = 0.15
+    sample_friction: Annotated[
+        float, Parameter(help="Coulomb friction at the sample.", validator=not_negative("1"))
+    ] = 0.05
+    p0: Annotated[
+        float, Parameter(help="Sample contact: pressure at zero clearance in MPa.", validator=positive("MPa"))
+    ] = 2.0
+    c0: Annotated[
+        float, Parameter(help="Sample contact: clearance where pressure starts in mm.", validator=positive("mm"))
+    ] = 0.01
+
+
+@Parameter(name="*", group=Group("Contact", sort_key=3))
+@dataclass(frozen=True)
+class ImprintOptions(ContactOptions):
+    """Contact with window and sample, where the measured surface is pressed in."""
+
     correct_approach: Annotated[
         bool, Parameter(help="Also shift out the approach of sample and layer that the contact law causes.")
     ] = False
@@ -85,14 +189,25 @@ class FitOptions:
     """What is known of the pressure before the map, and what is asked of the fit."""
 
     prior_length: Annotated[
-        float | None, Parameter(help="Correlation length of the pressure in mm. Default: three elements.")
+        float | None,
+        Parameter(
+            help="Correlation length of the pressure in mm. Default: three elements.",
+            validator=positive("mm", "a positive number, at least an element"),
+        ),
     ] = None
     prior_std: Annotated[
         float | None,
-        Parameter(help="Standard deviation of the pressure in MPa. Default: that of the uniaxial estimate."),
+        Parameter(
+            help="Standard deviation of the pressure in MPa. Default: that of the uniaxial estimate.",
+            validator=positive("MPa"),
+        ),
     ] = None
     prior_mean: Annotated[
-        float | None, Parameter(help="Mean of the pressure in MPa. Default: that of the uniaxial estimate.")
+        float | None,
+        Parameter(
+            help="Mean of the pressure in MPa. Default: that of the uniaxial estimate.",
+            validator=Quantity("MPa", "a number"),
+        ),
     ] = None
     hyperparameters: Annotated[
         Literal["given", "discrepancy", "evidence"],
@@ -101,36 +216,82 @@ class FitOptions:
     nonnegative: Annotated[bool, Parameter(help="Keep the pressure above zero.")] = False
     model_std: Annotated[
         float,
-        Parameter(help="Standard deviation of the computed thickness in mm, what the mesh is off; see op.mesh_error."),
+        Parameter(
+            help="Standard deviation of the computed thickness in mm, what the mesh is off; see op.mesh_error.",
+            validator=not_negative("mm"),
+        ),
     ] = 0.0
     friction_spread: Annotated[
         float | None,
-        Parameter(help="Relative uncertainty of both frictions, fitted as well and allowed for. Default: none."),
+        Parameter(
+            help="Relative uncertainty of both frictions, fitted as well and allowed for. Default: none.",
+            validator=positive("1"),
+        ),
     ] = None
     modulus_spread: Annotated[
         float | None,
-        Parameter(help="Relative uncertainty of C10, fitted as well and allowed for. Default: none."),
+        Parameter(
+            help="Relative uncertainty of C10, fitted as well and allowed for. Default: none.", validator=positive("1")
+        ),
     ] = None
-    draws: Annotated[int, Parameter(help="Draws of the posterior that standard deviations come from.")] = 16
+    draws: Annotated[
+        int,
+        Parameter(
+            help="Draws of the posterior that standard deviations come from.", validator=count(), converter=whole
+        ),
+    ] = 16
 
 
-@Parameter(name="*", group=Group("Run", sort_key=5))
+@Parameter(name="*", group=Group("Solver", sort_key=5))
 @dataclass(frozen=True)
-class RunOptions:
-    """The run itself."""
+class StepOptions:
+    """How a fit applies its load."""
+
+    increments: Annotated[
+        int | None, Parameter(help="Load increments. Default: the solver's own.", validator=count(), converter=whole)
+    ] = None
+
+
+@Parameter(name="*", group=Group("Solver", sort_key=5))
+@dataclass(frozen=True)
+class SolverOptions:
+    """Which solver computes, and how."""
 
     solver: Annotated[
         Literal["newton", "explicit"], Parameter(help="Implicit statics, or explicit dynamics as published.")
     ] = "newton"
-    increments: Annotated[int | None, Parameter(help="Load increments of newton. Default: the solver's own.")] = None
-    duration: Annotated[float | None, Parameter(help="Duration of explicit in s. Default: the published 1 s.")] = None
-    mass_scaling: Annotated[float | None, Parameter(help="Mass scaling of explicit. Default: the published 25.")] = None
+    increments: Annotated[
+        int | None,
+        Parameter(help="Load increments of newton. Default: the solver's own.", validator=count(), converter=whole),
+    ] = None
+    duration: Annotated[
+        float | None, Parameter(help="Duration of explicit in s. Default: the published 1 s.", validator=positive("s"))
+    ] = None
+    mass_scaling: Annotated[
+        float | None,
+        Parameter(help="Mass scaling of explicit. Default: the published 25.", validator=positive("1")),
+    ] = None
     precision: Annotated[
         Literal["float32", "float64"], Parameter(help="Precision of explicit; float32 takes half the time.")
     ] = "float64"
     checkpoint: Annotated[
-        Path | None, Parameter(help="File (.npz) that keeps the state of explicit, from which a killed run goes on.")
+        Path | None,
+        Parameter(
+            help="File (.npz) that keeps the state of explicit, from which a killed run goes on.",
+            validator=NewFile(".npz"),
+        ),
     ] = None
-    force: Annotated[bool, Parameter(help="Replace a finished result in --out.")] = False
-    no_cache: NoCache = False
+
+
+@Parameter(name="*", group=Group("Run", sort_key=6))
+@dataclass(frozen=True)
+class RunOptions:
+    """The run itself."""
+
+    force: Annotated[
+        bool, Parameter(help="Replace a finished result in --out, which stays as it is until the new one is complete.")
+    ] = False
+    no_cache: Annotated[
+        bool, Parameter(help="Compile anew and keep nothing, as with OPFEM_NO_CACHE=1 in the environment.")
+    ] = False
     debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False

@@ -1,95 +1,102 @@
-"""What every command of the command line shares: how it reports, ends, and looks after its folder of results."""
+"""How a command runs: it reports what goes wrong in one line, and ends where Ctrl-C asks for it."""
 
 import _thread
-import json
-import os
+import codecs
+import io
+import signal
+import socket
 import sys
-import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-import jax
-import xarray as xr
-from cyclopts import App, Parameter
-from rich.console import Console
+from . import INTERRUPTED, leave
+from .messages import in_options
 
-from ..compilation import cache_compilation, silence_alarm
-from ..inverse import FitError
-from ..io import whole_file, write_netcdf, write_vtu
-from ..solvers import ConvergenceError
-
-FINISHED = "result.nc"  # Written last: a folder that holds it holds a whole result.
-
-INTERRUPTED = 130
-
-app = App(
-    name="opfem",
-    help="Stress on tissue from the measured thickness of a soft layer.",
-    default_parameter=Parameter(negative=()),
-)
+# What compiles cannot be interrupted from Python; a process that has not ended by then [s] is ended.
+_GRACE = 5.0
+# Characters of the field that an encoding may lack, and what stands for them.
+_PLAIN = str.maketrans({"×": "x", "–": "-", "µ": "u", "μ": "u", "χ": "chi", "²": "2", "±": "+-", "³": "3", "…": "..."})
 
 
-def main(tokens: Sequence[str] | None = None) -> None:
-    """Run the command line and exit: 0 done, 1 failed, 2 misused, 130 interrupted.
+def tolerant_output() -> None:
+    """Replace what the encoding of the output lacks, where Python would raise."""
+    codecs.register_error("opfem", _degraded)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="opfem")
 
-    Args:
-        tokens: Arguments; None takes those of the process.
-    """
-    try:
-        app(tokens)
-    except SystemExit as end:
-        if end.code == INTERRUPTED and tokens is None:
-            # With a computation in flight jaxlib crashes while the interpreter winds down.
-            for stream in (sys.stdout, sys.stderr):
-                stream.flush()
-            os._exit(INTERRUPTED)
-        raise
+
+def _degraded(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    plain = error.object[error.start : error.end].translate(_PLAIN)
+    return "".join(letter if ord(letter) < 128 else "?" for letter in plain), error.end
 
 
 @contextmanager
 def reporting(debug: bool) -> Iterator[None]:
     """End with a message and an exit status instead of a traceback."""
+    interrupts: list[int] = []
     try:
-        with _redelivered_interrupts(), _warnings_in_yellow():
+        with _interruptible(interrupts), _remarks():
             yield
     except KeyboardInterrupt:
-        _complain("Interrupted; no file was left half-written.")
-        raise SystemExit(INTERRUPTED) from None
+        _end_interrupted()
+    except BrokenPipeError:
+        raise
     except Exception as cause:
+        if interrupts:  # what was interrupted may turn that into an error of its own
+            _end_interrupted()
         if debug:
             raise
-        expected = isinstance(cause, ValueError | OSError | ConvergenceError | FitError)
+        expected = isinstance(cause, ValueError | OSError) or type(cause).__module__.startswith("opfem.")
         unexpected = f"Unexpected {type(cause).__name__}: {cause} (--debug shows where; please report it.)"
-        _complain(str(cause) if expected else unexpected)
+        complain(in_options(str(cause)) if expected else unexpected)
         raise SystemExit(1) from None
 
 
+def complain(message: str) -> None:
+    """Say what is wrong."""
+    from rich.console import Console
+
+    Console(stderr=True, highlight=False).print(f"opfem: {message}", style="bold red", markup=False, soft_wrap=True)
+
+
 @contextmanager
-def _warnings_in_yellow() -> Iterator[None]:
-    """Show warnings as this program says things: in a line of their own, each once, without the line of code."""
+def _remarks() -> Iterator[None]:
+    """Say what the library warns of as this program says things: in a line, each once, in options."""
+    from rich.console import Console
+
     said: set[str] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if str(message) not in said:
-            said.add(str(message))
-            console = Console(stderr=True, highlight=False)
-            console.print(f"opfem: {message}", style="yellow", markup=False, soft_wrap=True)
+        text = in_options(str(message))
+        if text not in said:
+            said.add(text)
+            Console(stderr=True, highlight=False).print(f"opfem: {text}", style="yellow", markup=False, soft_wrap=True)
 
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
 
 
+def _end_interrupted() -> None:
+    complain("Interrupted; no file was left half-written.")
+    raise SystemExit(INTERRUPTED) from None
+
+
 @contextmanager
-def _redelivered_interrupts() -> Iterator[None]:
-    """Raise Ctrl-C again where Python drops it.
+def _interruptible(interrupts: list[int]) -> Iterator[None]:
+    """Raise Ctrl-C as KeyboardInterrupt, also where Python drops it, and end the process if that does not.
 
     An exception in a callback of the garbage collector is printed and forgotten, and jax has such a callback, which
     runs often while it traces.
+
+    Args:
+        interrupts: Gets one entry for each Ctrl-C.
     """
     report = sys.unraisablehook
 
@@ -99,77 +106,45 @@ def _redelivered_interrupts() -> Iterator[None]:
         else:
             report(dropped)
 
+    def interrupt(number: int, _: Any) -> None:
+        interrupts.append(number)
+        raise KeyboardInterrupt
+
     sys.unraisablehook = redeliver
+    own = signal.getsignal(signal.SIGINT) is leave
     try:
-        yield
+        if own:
+            with _ended_in_time():
+                signal.signal(signal.SIGINT, interrupt)
+                yield
+        else:
+            yield
     finally:
+        if own:
+            signal.signal(signal.SIGINT, leave)
         sys.unraisablehook = report
 
 
-def _complain(message: str) -> None:
-    Console(stderr=True, highlight=False).print(f"opfem: {message}", style="bold red", markup=False, soft_wrap=True)
+@contextmanager
+def _ended_in_time() -> Iterator[None]:
+    """End the process where a Ctrl-C has not done so in time: Python hears of it only between its own instructions."""
+    heard, bell = socket.socketpair()
+    bell.setblocking(False)
+    ended = threading.Event()
+    former = signal.set_wakeup_fd(bell.fileno(), warn_on_full_buffer=False)
 
+    def watch() -> None:
+        with heard:
+            while signal.SIGINT not in (number := heard.recv(1)):
+                if not number:
+                    return
+        if not ended.wait(_GRACE):
+            leave()
 
-def configure_jax(no_cache: bool) -> None:
-    """Compute in float64, and keep compiled programs for the commands to come."""
-    jax.config.update("jax_enable_x64", True)
-    if no_cache:
-        silence_alarm()
-    else:
-        cache_compilation()
-
-
-def refuse_finished(out: Path, force: bool) -> None:
-    """Raise FileExistsError where a folder holds a finished result that may not be replaced."""
-    if (out / FINISHED).exists() and not force:
-        raise FileExistsError(
-            f"{out} holds a finished result ({FINISHED}). Pass --force to replace it, or another --out."
-        )
-
-
-def prepare(out: Path) -> None:
-    """Find out before the long solve whether the results can be written."""
+    threading.Thread(target=watch, name="opfem Ctrl-C", daemon=True).start()
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as cause:
-        raise OSError(f"Cannot write results to {out}: {cause.strerror}. Choose another --out.") from cause
-
-
-def write_files(
-    dataset: xr.Dataset, figures: dict[str, Any], numbers: dict[str, Any], files: Sequence[str], out: Path
-) -> None:
-    """Write every file of a result, each whole or not at all, `result.nc` last.
-
-    Args:
-        dataset: What was solved or fitted.
-        figures: Matplotlib figures by file name.
-        numbers: For summary.json.
-        files: All files of such a result.
-        out: Folder of the results.
-    """
-    remove(out, files)
-    for name, figure in figures.items():
-        with whole_file(out / name) as temporary:
-            figure.savefig(temporary, dpi=200)
-    write_vtu(dataset, out / "result.vtu")
-    write_summary(numbers, out)
-    write_netcdf(dataset, out / FINISHED)
-
-
-def write_summary(numbers: dict[str, Any], out: Path) -> None:
-    """Write summary.json.
-
-    Args:
-        numbers: In types that JSON knows.
-        out: Folder of the results.
-    """
-    with whole_file(out / "summary.json") as temporary:
-        temporary.write_text(json.dumps(numbers, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def remove(out: Path, files: Sequence[str]) -> None:
-    """Remove files of an earlier result, the mark of a finished one, named last, first."""
-    for name in reversed(files):
-        (out / name).unlink(missing_ok=True)
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(former)
+        bell.close()

@@ -2,16 +2,33 @@
 
 import dataclasses
 import math
+import warnings
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from .._types import ScalarLike
+from ..compilation import cache_compilation, silence_alarm
 from ..io import read_thickness
-from ..measurement import EXAMPLE_LAYER, ThicknessMap, example_map
-from ..model import Contact, ExponentialOverclosure, HardOverclosure, Imprint, Layer, MooneyRivlin, Palpation
+from ..measurement import EXAMPLE_LAYER, MeasurementError, MeasurementWarning, ThicknessMap, example_map
+from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
+from .messages import in_options
 from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
+
+_SHARED = ("extent", "unit", "scale", "max_missing")  # by the loaded and the unloaded map
+
+
+def configure_jax(no_cache: bool) -> None:
+    """Compute in float64, and keep compiled programs for the commands to come."""
+    jax.config.update("jax_enable_x64", True)
+    if no_cache:
+        silence_alarm()
+    else:
+        cache_compilation()
 
 
 def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | ThicknessMap]:
@@ -25,22 +42,30 @@ def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | Thi
         ValueError: When options are missing or contradict each other.
         MeasurementError: For anything wrong with a file.
     """
-    grid: dict[str, Any] = {"extent": options.extent, "spacing": options.spacing, "unit": options.unit}
+    how: dict[str, Any] = {name: getattr(options, name) for name in _SHARED}
+    how |= {"spacing": _spacing(options.spacing), "missing": _missing(options.missing)}
+    if options.max_bytes is not None:
+        how["max_bytes"] = options.max_bytes
     if path == "example":
-        given = [f"--{name}" for name in ("extent", "spacing", "std", "variable") if getattr(options, name) is not None]
+        names = ("extent", "spacing", "std", "variable", "scale", "missing", "mask")
+        given = [f"--{name}" for name in names if getattr(options, name) is not None]
         if given or options.unit != "mm":
             raise ValueError(f"The example knows its own grid; leave out {', '.join(given) or '--unit'}.")
         loaded = example_map()
     else:
-        loaded = read_thickness(path, std=options.std, variable=options.variable, **grid)
+        loaded = _read(path, std=options.std, variable=options.variable, mask=options.mask, **how)
     if options.l0 is None:
         if path != "example":
             raise ValueError("--l0 is needed: the unloaded thickness, a number in mm or the path of a map.")
         return loaded, EXAMPLE_LAYER
     try:
-        return loaded, float(options.l0)
+        number = float(options.l0)
     except ValueError:
-        unloaded = read_thickness(options.l0, variable=options.l0_variable, **grid)
+        unloaded = _of_l0(lambda: _read(str(options.l0), variable=options.l0_variable, **how))
+    else:
+        if options.l0_variable is not None:
+            raise ValueError(f"--l0-variable needs the path of a map in --l0, got the number {options.l0}.")
+        return loaded, number
     if unloaded.shape != loaded.shape:
         raise ValueError(
             f"--l0 [pixels] must be on the grid of MAP, {loaded.shape} rows and columns, got {unloaded.shape}. "
@@ -49,14 +74,50 @@ def read_maps(path: str, options: MapOptions) -> tuple[ThicknessMap, float | Thi
     return loaded, unloaded
 
 
+def _of_l0(read: Callable[[], ThicknessMap]) -> ThicknessMap:
+    """Say of which of the two maps an error is."""
+    try:
+        return read()
+    except MeasurementError as cause:
+        raise MeasurementError(f"--l0 {cause}".replace("holds no variable", "holds no --l0-variable")) from cause
+
+
+def _read(path: str, **how: Any) -> ThicknessMap:
+    """Read a map, and say what is odd."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", MeasurementWarning)
+        read = read_thickness(path, **how)
+    console = Console(stderr=True, highlight=False)
+    for warning in said:
+        console.print(f"opfem: {in_options(str(warning.message))}", style="yellow", markup=False, soft_wrap=True)
+    return read
+
+
+def _spacing(stated: tuple[float, ...] | None) -> float | tuple[float, ...] | None:
+    if stated is not None and len(stated) > 2:
+        raise ValueError(f"--spacing [mm] must be two numbers, DX DY, or one for both, got {stated}.")
+    return stated[0] if stated is not None and len(stated) == 1 else stated
+
+
+def _missing(stated: str | None) -> Any:
+    if stated is None or stated == "none":
+        return stated
+    try:
+        return tuple(float(part) for part in stated.split(","))
+    except ValueError:
+        raise ValueError(
+            f"--missing must be numbers of the file with commas between them, or none, got {stated!r}."
+        ) from None
+
+
 def state_experiment(
     measured: ThicknessMap,
     unloaded: float | ThicknessMap,
     reading: MapOptions,
     layer: LayerOptions,
     contact: ContactOptions,
-) -> tuple[Palpation, Imprint]:
-    """State the experiment and its load; the maps are filled and smoothed here.
+) -> tuple[Palpation, ThicknessMap]:
+    """State the experiment, and the loaded thickness without missing pixels; the maps are filled and smoothed here.
 
     Args:
         measured: Loaded thickness as measured.
@@ -75,7 +136,21 @@ def state_experiment(
         fwhm = 0.5 * min(length / max(count, 1) for length, count in zip(extent, layer.elements[:2], strict=True))
     if isinstance(unloaded, ThicknessMap):
         unloaded = _ready(unloaded, fwhm)
-    palpation = Palpation(
+    return state_palpation(unloaded, extent, layer, contact), _ready(measured, fwhm)
+
+
+def state_palpation(
+    unloaded: ScalarLike | ThicknessMap, extent: tuple[float, float], layer: LayerOptions, contact: ContactOptions
+) -> Palpation:
+    """State the experiment, which checks its numbers.
+
+    Args:
+        unloaded: Unloaded thickness [mm].
+        extent: Of the layer [mm].
+        layer: Material, mesh and sides.
+        contact: Contact with window and sample.
+    """
+    return Palpation(
         Layer(unloaded, _material(layer)),
         extent=extent,
         elements=layer.elements,
@@ -84,7 +159,6 @@ def state_experiment(
         sides=layer.sides,
         element=layer.element,
     )
-    return palpation, Imprint(_ready(measured, fwhm), correct_approach=contact.correct_approach)
 
 
 def show_assumptions(
@@ -105,7 +179,7 @@ def show_assumptions(
     rows = {
         "layer": f"{palpation.extent[0]:g} × {palpation.extent[1]:g} mm, "
         + ("measured L0" if isinstance(unloaded, ThicknessMap) else f"L0 = {float(unloaded):g} mm"),
-        "map": f"{thickness.shape[1]} × {thickness.shape[0]} pixels, {missing} missing"
+        "map": f"{thickness.shape[1]} × {thickness.shape[0]} pixels of {_pixel(thickness)}, {missing} missing"
         + ((" and filled" if thickness.is_filled else " and left out") if missing else ""),
         "smoothing": " and ".join(f"{1e3 * width:g} µm FWHM" for width in _smoothing(thickness)) or "none",
         "material": f"Mooney–Rivlin C10 = {1e3 * material.c10:g} kPa, C01 = {1e3 * material.c01:g} kPa, "
@@ -163,7 +237,7 @@ def _material(options: LayerOptions) -> MooneyRivlin:
 
 
 def settings_of(
-    path: str, reading: MapOptions, layer: LayerOptions, contact: ContactOptions, load: Imprint
+    path: str, reading: MapOptions, layer: LayerOptions, contact: ContactOptions, thickness: ThicknessMap
 ) -> dict[str, Any]:
     """Collect what was asked for and what was assumed, for summary.json."""
     given = {name: value for part in (reading, layer, contact) for name, value in dataclasses.asdict(part).items()}
@@ -171,10 +245,17 @@ def settings_of(
     used: dict[str, Any] = {name: float(getattr(material, name)) for name in ("c10", "c01", "bulk")}
     if math.isinf(used["bulk"]):
         used["bulk"] = "inf"  # JSON has no infinite number; --bulk reads this
-    used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(load.thickness)[-1]
+    used["smooth"] = reading.smooth if reading.smooth is not None else _smoothing(thickness)[-1]
     assumed = [name for name in used if given[name] is None]
     stated = {name: value for name, value in given.items() if value is not None}
     return {"map": path, **stated, **used, "assumed": assumed}
+
+
+def _pixel(thickness: ThicknessMap) -> str:
+    """Size of a pixel, and where it is from."""
+    size = " × ".join(f"{1e3 * float(step):.4g}" for step in thickness.spacing) + " µm"
+    from_file = any(bool(step.numbers.get("spacing_from_file", False)) for step in thickness.steps)
+    return f"{size} (as the file says)" if from_file else size
 
 
 def _smoothing(thickness: ThicknessMap) -> list[float]:

@@ -3,33 +3,40 @@
 The file says what `opfem palpate` would be told, which of its numbers vary, and what to keep.
 """
 
+import dataclasses
 import shutil
 import tomllib
 import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
-from cyclopts import Parameter
 from rich.console import Console
 from scipy.stats import qmc
 
-from .. import sweep as computation
 from ..datasets import coin_file
-from ..model import Palpation
+from ..io import finish, take_place
+from ..model import Imprint, Palpation
+from ..results.dataset import STATS
 from ..solvers import Newton, Solution, solve
 from ..solvers.discretise import check_compatible
 from ..solvers.progress import Progress
-from ..sweep import Batch, sample, zip_
-from ..sweep.design import Points, grid, known_name
-from ..sweep.outputs import GOOD
-from ..sweep.store import FINISHED, PLAN, POINTS
-from .options import ContactOptions, LayerOptions, MapOptions, NoCache
-from .running import configure_jax, reporting
-from .statement import read_maps, state_experiment
+from ..sweeps import Batch, sample, sweep as compute, zip_
+from ..sweeps.design import Points, grid, known_name
+from ..sweeps.outputs import FIELDS, GOOD
+from ..sweeps.store import FINISHED, PLAN, POINTS
+from .folder import prepare, refuse_links
+from .messages import in_options, validators
+from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions
+from .statement import configure_jax, read_maps, state_experiment, state_palpation
+
+# All that a sweep writes, the mark of a finished one last.
+RESULT = (POINTS, PLAN, FINISHED)
+# Where a sweep is computed that is to take the place of the one in the folder around it.
+_REPLACEMENT = ".opfem-replacement"
 
 
 class _Axis(NamedTuple):
@@ -57,6 +64,7 @@ _UNITS = {
 }
 _Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
+_MOST_STATED = 200  # points that are checked one by one, a millisecond each
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
 
@@ -66,54 +74,43 @@ class _Inputs(NamedTuple):
     map: str
     reading: MapOptions
     layer: LayerOptions
-    contact: ContactOptions
+    contact: ImprintOptions
     increments: int | None
 
 
-def sweep(
-    config: Annotated[Path, Parameter(name="CONFIG")],
-    /,
-    *,
-    out: Path,
-    resume: Annotated[bool, Parameter(help="Go on with the sweep that --out holds.")] = False,
-    force: Annotated[bool, Parameter(help="Remove the sweep that --out holds, and begin anew.")] = False,
-    no_cache: NoCache = False,
-    debug: Annotated[bool, Parameter(help="Show where an error came from.")] = False,
-) -> None:
-    """Solve for many values of materials, frictions and thickness, as CONFIG says.
+def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
+    """Solve at all points that a file states, and write the table.
 
-    Writes result.nc, labelled by the axes, and every finished point on the way.
+    Everything in the file is checked before the folder is touched or a program compiled.
 
     Args:
-        config: A .toml file with [inputs], [axes] and [outputs]; the README shows one.
+        config: The file.
         out: Folder of the results.
-        resume: Whether to go on.
-        force: Whether to begin anew.
-        no_cache: Whether to do without compiled programs on disk.
-        debug: Whether to show tracebacks.
+        resume: Whether to go on with what the folder holds.
+        run: The run itself.
     """
-    with reporting(debug):
-        with Progress(True, at_once=True) as progress:
-            progress.stage("reading")
-            configure_jax(no_cache)
-            stated = _read(config)
-            _settle_folder(out, resume, force)
-            points = _points(stated["axes"], stated.get("design", {}))
-            keep = stated["outputs"]["keep"]
-            if not (isinstance(keep, list) and keep and all(isinstance(name, str) for name in keep)):
-                raise ValueError(f"[outputs] keep must be a list of names, got {keep!r}.")
-            function = _function(_inputs(stated["inputs"], points, config.parent), tuple(points.columns))
-            execution = Batch(**stated.get("execution", {}))
-            data = computation(function, points, keep=keep, execution=execution, out=out)
-        failed = int(np.sum(~np.isin(data.status, GOOD)))
-        console = Console(highlight=False)
-        console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
+    with Progress(True, at_once=True) as progress:
+        progress.stage("reading")
+        configure_jax(run.no_cache)
+        stated = _read(config)
+        points = _points(stated["axes"], stated.get("design", {}))
+        keep = _keep(stated["outputs"]["keep"])
+        execution = _execution(stated.get("execution", {}))
+        function = _function(_inputs(stated["inputs"], points, config.parent), points)
+        folder = _settle(out, resume, run.force)
+        prepare(out)
+        data = compute(function, points, keep=keep, execution=execution, out=folder)
+        if folder != out:
+            take_place(out, folder, RESULT)
+    failed = int(np.sum(~np.isin(data.status, GOOD)))
+    console = Console(highlight=False)
+    console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
 
 
 def _read(config: Path) -> dict[str, Any]:
     """Read a file and check the names of what it holds."""
     try:
-        stated = tomllib.loads(config.read_text(encoding="utf-8"))
+        stated = tomllib.loads(config.read_text(encoding="utf-8-sig"))
     except OSError as cause:
         raise ValueError(f"Cannot read {config}: {cause.strerror}.") from cause
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
@@ -136,37 +133,73 @@ def _read(config: Path) -> dict[str, Any]:
     return stated
 
 
-def _settle_folder(out: Path, resume: bool, force: bool) -> None:
-    begun = (out / PLAN).exists()
+def _settle(out: Path, resume: bool, force: bool) -> Path:
+    """Find the folder to compute in: an old sweep that is to be replaced stays until the new one is complete."""
+    finish(out, RESULT)
+    begun, replacement = (out / PLAN).exists(), out / _REPLACEMENT
+    if (out / FINISHED).exists() and not begun:
+        raise FileExistsError(f"--out {out} holds the result of another command. Choose another --out.")
     if force and begun:
-        (out / FINISHED).unlink(missing_ok=True)
-        shutil.rmtree(out / POINTS, ignore_errors=True)
-        (out / PLAN).unlink()
-    elif begun and not resume:
-        raise FileExistsError(f"{out} holds a sweep. Pass --resume to go on with it, --force to replace it.")
-    elif resume and not begun:
-        raise ValueError(f"{out} holds no sweep to go on with. Leave out --resume.")
+        refuse_links(out, RESULT)
+        shutil.rmtree(replacement, ignore_errors=True)
+        return replacement
+    if resume and (replacement / PLAN).exists():
+        return replacement
+    if begun and not resume:
+        raise FileExistsError(f"--out {out} holds a sweep. Pass --resume to go on with it, --force to replace it.")
+    if resume and not begun:
+        raise ValueError(f"--out {out} holds no sweep to go on with. Leave out --resume.")
+    refuse_links(out, ())
+    return out
+
+
+def _keep(names: Any) -> list[str]:
+    if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+        raise ValueError(f"[outputs] keep must be a list of names, got {names!r}.")
+    for name in names:
+        known_name("[outputs] keep", name, (*FIELDS, *STATS))
+    if len(set(names)) < len(names):
+        raise ValueError(f"[outputs] keep must name each output once, got {names!r}.")
+    return names
+
+
+def _execution(stated: Mapping[str, Any]) -> Batch:
+    hints: dict[str, Any] = {"size": int, "mode": str, "threads": int}
+    given = {name: _converted(f"[execution] {name}", hints[name], value) for name, value in stated.items()}
+    try:
+        return Batch(**given)
+    except ValueError as cause:
+        raise ValueError(str(cause).replace("Batch.", "[execution] ")) from None
 
 
 def _points(axes: Mapping[str, Any], design: Mapping[str, Any]) -> Points:
     """Read axes in their units; make the points."""
     kind = design.get("kind", "grid")
     known_name("[design] kind", kind, _DESIGNS)
+    if not axes:
+        raise ValueError("[axes] must name at least one number that varies, got none.")
     units = {name: _AXES[name].unit for name in axes}
     if kind in ("grid", "zip"):
+        drawn = [name for name in ("points", "seed") if name in design]
+        if drawn:
+            raise ValueError(f"[design] {drawn[0]} is for kind sobol and latin_hypercube, got kind {kind!r}.")
         values = {name: _checked(name, _values(name, axis) * _factor(name, axis)) for name, axis in axes.items()}
         return (grid if kind == "grid" else zip_)(values).with_units(units)
     count, seed = (_converted(f"[design] {name}", int, design.get(name, 0)) for name in ("points", "seed"))
     if count < 1:
         raise ValueError(f"[design] points must be a whole number of at least 1, got {count}.")
+    if seed < 0:
+        raise ValueError(f"[design] seed must be a whole number of at least 0, got {seed}.")
     sampler = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}[kind](d=len(axes), rng=seed)
     bounds, log = {}, []
     for name, axis in axes.items():
         if not isinstance(axis, dict) or not {"from", "to"} <= set(axis) <= {"from", "to", "log", "unit"}:
-            raise ValueError(f"[axes] {name} of a {kind} design must be {{ from = , to = , log = , unit = }}.")
+            raise ValueError(
+                f"[axes] {name} of a {kind} design must be {{ from = , to = , log = , unit = }}, got {axis!r}."
+            )
         ends = _checked(name, _numbers(name, [axis["from"], axis["to"]]) * _factor(name, axis))
         bounds[name] = (float(ends[0]), float(ends[1]))
-        log += [name] if axis.get("log") else []
+        log += [name] if _is_log(name, axis) else []
     return sample(bounds, sampler.random(count), log).with_units(units)
 
 
@@ -179,27 +212,33 @@ def _values(name: str, axis: Any) -> np.ndarray:
     if isinstance(axis, dict) and {"from", "to", "points"} <= set(axis) <= {"from", "to", "points", "log", "unit"}:
         low, high = _numbers(name, [axis["from"], axis["to"]])
         count = _converted(f"[axes] {name} points", int, axis["points"])
-        if axis.get("log") and not (low > 0 and high > 0):
+        if count < 1:
+            raise ValueError(f"[axes] {name} points must be a whole number of at least 1, got {count}.")
+        log = _is_log(name, axis)
+        if log and not (low > 0 and high > 0):
             raise ValueError(f"[axes] {name} must run between positive numbers for log = true, got {low} to {high}.")
-        return (np.geomspace if axis.get("log") else np.linspace)(low, high, max(count, 0))
+        return (np.geomspace if log else np.linspace)(low, high, count)
     raise ValueError(
         f"[axes] {name} must be a list of numbers, {{ values = [...], unit = }} or "
         f"{{ from = , to = , points = , log = , unit = }}, got {axis!r}."
     )
 
 
+def _is_log(name: str, axis: Mapping[str, Any]) -> bool:
+    return _converted(f"[axes] {name} log", bool, axis.get("log", False))
+
+
 def _numbers(name: str, values: Any) -> np.ndarray:
-    array = np.asarray(values)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "fi"):
-        raise ValueError(f"[axes] {name} must hold numbers, got {values!r}.")
-    return array.astype(float)
+    if not isinstance(values, list):
+        raise ValueError(f"[axes] {name} must hold a list of numbers, got {values!r}.")
+    array = np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    return array if np.isfinite(array).all() else _checked(name, array)  # before numbers are made of infinity
 
 
 def _factor(name: str, axis: Any) -> float:
     known = _UNITS[_AXES[name].unit]
     unit = axis.get("unit", _AXES[name].unit) if isinstance(axis, dict) else _AXES[name].unit
-    if unit not in known:
-        raise ValueError(f"[axes] {name} unit must be one of {', '.join(known)}, got {unit!r}.")
+    known_name(f"[axes] {name} unit", unit, tuple(known))
     return known[unit]
 
 
@@ -213,20 +252,38 @@ def _checked(name: str, values: np.ndarray) -> np.ndarray:
 
 def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
     """Convert the inputs to the options of `opfem palpate`; an axis takes the place of its option."""
-    groups = (MapOptions, LayerOptions, ContactOptions)
-    hints = {name: hint for group in groups for name, hint in typing.get_type_hints(group).items()}
+    groups = (MapOptions, LayerOptions, ImprintOptions)
+    hints = {name: hint for group in groups for name, hint in typing.get_type_hints(group, include_extras=True).items()}
+    hints |= {"map": str, "increments": int}
     given = {}
     for name, value in stated.items():
-        known_name("[inputs]", name, ("map", "increments", *hints))
+        known_name("[inputs]", name, tuple(hints))
         if name in points.columns:
             raise ValueError(f"[inputs] {name} is also one of the [axes]. Leave one out.")
-        given[name] = _converted(f"[inputs] {name}", {"map": str, "increments": int, **hints}[name], value)
+        if name in ("l0", "missing") and isinstance(value, int | float) and not isinstance(value, bool):
+            value = str(value)
+        value = _converted(f"[inputs] {name}", _plain(hints[name]), value)
+        given[name] = _path(value, folder) if name in ("l0", "map", "mask") else value
+        for check in getattr(hints[name], "__metadata__", ()):
+            _check(f"[inputs] {name}", validators(check.validator), given[name])
     given |= {name: float(column[0]) for name, column in points.columns.items()}
-    if "l0" in given:
-        given["l0"] = _path(str(given["l0"]), folder)
-    path = str(coin_file()) if given["map"] == "coin" else _path(given["map"], folder)
-    reading, layer, contact = _group(MapOptions, given), _group(LayerOptions, given), _group(ContactOptions, given)
+    if "l0" in points.columns:
+        given["l0"] = str(given["l0"])
+    path = str(coin_file()) if given["map"] == "coin" else given["map"]
+    reading, layer, contact = _group(MapOptions, given), _group(LayerOptions, given), _group(ImprintOptions, given)
     return _Inputs(path, reading, layer, contact, given.get("increments"))
+
+
+def _check(what: str, checks: tuple[Any, ...], value: Any) -> None:
+    for check in checks:
+        try:
+            check(None, value)
+        except ValueError as cause:
+            raise ValueError(f"{what} {cause}") from None
+
+
+def _plain(hint: Any) -> Any:
+    return hint.__origin__ if hasattr(hint, "__metadata__") else hint
 
 
 def _group(kind: type[_Options], given: Mapping[str, Any]) -> _Options:
@@ -240,32 +297,48 @@ def _path(name: str, folder: Path) -> str:
 
 
 def _converted(what: str, hint: Any, value: Any) -> Any:
-    """Convert a value of TOML to the type of an option."""
+    """Convert a value of TOML to the type of an option; raise ValueError where it is of another."""
     choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for choice in choices:
         parts = typing.get_args(choice)
         if typing.get_origin(choice) is Literal:
             if value in parts:
                 return value
+        elif typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
+            items = value if isinstance(value, list) else [value]
+            return tuple(_converted(what, parts[0], item) for item in items)
         elif typing.get_origin(choice) is tuple:
             if isinstance(value, list) and len(value) == len(parts):
                 return tuple(_converted(what, part, item) for part, item in zip(parts, value, strict=True))
         elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
-        elif choice is str and isinstance(value, str | int | float) and not isinstance(value, bool):
-            return str(value)
         elif choice is not float and type(value) is choice:
             return value
-    expected = " or ".join(getattr(c, "__name__", str(c)) if not typing.get_args(c) else str(c) for c in choices)
-    raise ValueError(f"{what} must be {expected.replace(' or NoneType', '')}, got {value!r}.")
+    expected = " or ".join(filter(None, map(_in_words, choices)))
+    raise ValueError(f"{what} must be {expected}, got {value!r}.")
 
 
-def _function(inputs: _Inputs, names: tuple[str, ...]) -> Callable[..., Solution]:
-    """State the experiment as a function of the numbers that vary."""
+def _in_words(choice: Any) -> str:
+    """Name a type as TOML's users do."""
+    parts = typing.get_args(choice)
+    if typing.get_origin(choice) is Literal:
+        return "one of " + ", ".join(map(str, parts))
+    if typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
+        return f"{_in_words(parts[0])}, or a list of such"
+    if typing.get_origin(choice) is tuple:
+        return f"a list of {len(parts)}, each {_in_words(parts[0])}"
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(choice, "")
+
+
+def _function(inputs: _Inputs, points: Points) -> Callable[..., Solution]:
+    """State the experiment as a function of the numbers that vary, after checking them."""
     measured, unloaded = read_maps(inputs.map, inputs.reading)
-    palpation, load = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
+    palpation, thickness = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
+    _check_points(inputs, palpation, points)
+    load = Imprint(thickness, correct_approach=inputs.contact.correct_approach)
     check_compatible(palpation, load, None)  # inside jit nothing can
     solver = Newton() if inputs.increments is None else Newton(increments=inputs.increments)
+    names = tuple(points.columns)
 
     def solution(**numbers) -> Solution:
         varied = eqx.tree_at(
@@ -274,3 +347,30 @@ def _function(inputs: _Inputs, names: tuple[str, ...]) -> Callable[..., Solution
         return solve(varied, load, solver, throw=False, progress=False)
 
     return solution
+
+
+def _check_points(inputs: _Inputs, palpation: Palpation, points: Points) -> None:
+    """State the experiment at the points, which checks their numbers; inside jit nothing can.
+
+    Of very many points those at the ends of every axis are stated, where numbers go wrong first, and some between.
+    """
+    extent = (float(palpation.extent[0]), float(palpation.extent[1]))
+    layers, contacts = (tuple(typing.get_type_hints(group)) for group in (LayerOptions, ImprintOptions))
+    seen = set()
+    chosen = set(np.linspace(0, len(points) - 1, min(len(points), _MOST_STATED)).astype(int).tolist())
+    chosen |= {int(end) for column in points.columns.values() for end in (np.argmin(column), np.argmax(column))}
+    for i in sorted(chosen):
+        numbers = {name: float(column[i]) for name, column in points.columns.items()}
+        unloaded = numbers.get("l0", palpation.layer.thickness)
+        for group in ({"l0", *layers}, set(contacts)):  # independent of each other: each combination once
+            own = {name: value for name, value in numbers.items() if name in group}
+            if tuple(own.items()) in seen:
+                continue
+            seen.add(tuple(own.items()))
+            layer = dataclasses.replace(inputs.layer, **{n: v for n, v in own.items() if n in layers})
+            contact = dataclasses.replace(inputs.contact, **{n: v for n, v in own.items() if n in contacts})
+            try:
+                state_palpation(unloaded, extent, layer, contact)
+            except ValueError as cause:
+                at = ", ".join(f"{name} = {value:g}" for name, value in own.items())
+                raise ValueError(f"[axes] at {at}: {in_options(str(cause))}") from None

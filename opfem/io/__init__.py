@@ -1,20 +1,25 @@
 """Files in and out: the only part of the package that touches a disk."""
 
 from ..measurement import MeasurementError
-from .atomic import whole_file
+from .atomic import finish, take_place, whole_file, write_together
 from .checkpoint import Checkpoint as Checkpoint
-from .netcdf import read_netcdf, write_netcdf
+from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
 from .thickness import read_thickness, write_thickness
-from .vtk import layer_grid, write_pvd, write_vtu
+from .vtk import layer_grid, vtu_bytes, write_pvd, write_vtu
 
 __all__ = [
     "MeasurementError",
+    "finish",
     "layer_grid",
+    "netcdf_bytes",
     "read_netcdf",
     "read_thickness",
+    "take_place",
+    "vtu_bytes",
     "whole_file",
     "write_netcdf",
     "write_pvd",
     "write_thickness",
+    "write_together",
     "write_vtu",
 ]

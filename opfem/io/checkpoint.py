@@ -47,7 +47,7 @@ class Checkpoint:
             state: Any PyTree of arrays.
         """
         arrays: dict[str, Any] = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
-        with whole_file(self.path) as temporary:
+        with whole_file(self.path, sum(array.nbytes for array in arrays.values())) as temporary:
             np.savez(temporary, **{_HASH: np.array(inputs_hash(inputs=inputs)), **arrays})
 
     def restore(self, inputs: Any, like: Any) -> Any:

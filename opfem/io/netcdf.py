@@ -4,11 +4,13 @@ Edge of the chain: what `to_xarray` labelled is stored with all its attributes, 
 """
 
 import os
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import xarray as xr
 
-from .atomic import whole_file
+from .atomic import write_whole
 
 _COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
 
@@ -26,11 +28,24 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike) -> None:
     """
     if not isinstance(dataset, xr.Dataset):
         raise ValueError(f"write_netcdf takes a dataset, got {type(dataset).__name__}. Pass to_xarray(solution).")
+    write_whole(path, netcdf_bytes(dataset))
+
+
+def netcdf_bytes(dataset: xr.Dataset) -> memoryview:
+    """Encode a dataset as compressed netCDF-4 in memory; HDF5 itself crashes on a full disk.
+
+    Args:
+        dataset: What `to_xarray` returned.
+    """
     numeric = [name for name, values in dataset.variables.items() if values.ndim and values.dtype.kind in "fiub"]
     encoding = dict.fromkeys(numeric, _COMPRESSION)
-    with whole_file(path) as temporary:
+    # With a client of dask at work xarray would ask it for a lock named by the buffer, and fail.
+    dask = sys.modules.get("dask")
+    with nullcontext() if dask is None else dask.config.set(scheduler="synchronous"):
         # What another file stored by is not how this one is to be stored.
-        dataset.drop_encoding().to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+        content = dataset.drop_encoding().to_netcdf(engine="h5netcdf", encoding=encoding)
+    assert isinstance(content, memoryview)
+    return content
 
 
 def read_netcdf(path: str | os.PathLike) -> xr.Dataset:

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from .atomic import whole_file
+from .atomic import write_whole
 
 if TYPE_CHECKING:
     import pyvista
@@ -59,10 +59,27 @@ def write_vtu(dataset: xr.Dataset, path: str | os.PathLike) -> None:
         ValueError: For another suffix, or a failed solution, which has no deformed layer.
         FileNotFoundError: When the folder does not exist.
     """
-    path = _with_suffix(path, ".vtu")
-    grid = layer_grid(dataset)
-    with whole_file(path) as temporary:
-        grid.save(temporary)
+    write_whole(_with_suffix(path, ".vtu"), vtu_bytes(dataset))
+
+
+def vtu_bytes(dataset: xr.Dataset) -> bytes:
+    """Encode the deformed layer as a .vtu file in memory; VTK itself crashes on a full disk.
+
+    Args:
+        dataset: What `to_xarray` returned.
+
+    Raises:
+        ValueError: For a failed solution, which has no deformed layer.
+    """
+    # Loaded here, so that `import opfem` stays free of it.
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(layer_grid(dataset))
+    writer.SetWriteToOutputString(True)
+    writer.SetDataModeToBinary()  # in base64
+    writer.Write()
+    return writer.GetOutputString().encode()
 
 
 def write_pvd(datasets: Sequence[xr.Dataset], path: str | os.PathLike, times: Sequence[float] | None = None) -> None:
@@ -89,8 +106,7 @@ def write_pvd(datasets: Sequence[xr.Dataset], path: str | os.PathLike, times: Se
         name = f"{path.stem}_{number:03d}.vtu"
         write_vtu(dataset, path.with_name(name))
         ElementTree.SubElement(collection, "DataSet", timestep=repr(float(time)), part="0", file=name)
-    with whole_file(path) as temporary:
-        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+    write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
 def _with_suffix(path: str | os.PathLike, suffix: str) -> Path:

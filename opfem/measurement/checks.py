@@ -1,10 +1,10 @@
 """Checks of what a user hands to a `ThicknessMap`; each raises a `ValueError` that names the next step.
 
 Only concrete numbers can be checked: inside jit, grad and vmap the checks of values do nothing,
-those of shapes still hold.
+those of shapes still hold. `piles` and `off_square` are for readers: what they find may be meant.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,12 @@ from .._checks import concrete
 THINNEST = 1e-3
 THICKEST = 50.0
 """Range [mm] that the thickest pixel of a plausible map lies in; outside it the unit is in doubt."""
+
+_FULL_SCALE = (255, 1023, 4095, 16383, 65535, 2**31 - 1, 2**32 - 1)  # largest numbers of 8 to 32 bits
+_FEWEST_OTHERS = 4  # distinct numbers that make a range to compare with
+_FEWEST_ALIKE = 4  # pixels that share a number by more than chance
+_APART = 0.25  # of the range of the others; one step of a map in whole µm is below 0.1
+_TOO_OFTEN = 10  # times the number of pixels that share any other number
 
 
 def check_map_shape(values: Any) -> None:
@@ -62,7 +68,7 @@ def check_thickness(values: Any, mask: Any) -> None:
     if low.any():
         raise ValueError(
             f"ThicknessMap.values [mm] must be positive, got {thickness[low][0]:g} in {_pixels(low)}; "
-            "mask what is not data: mask= here, NaN in a file."
+            "mask what is not data: mask= here, missing= in read_thickness."
         )
     doubt = doubtful_unit(thickness[~masked])
     if doubt:
@@ -115,3 +121,63 @@ def check_std(std: Any, mask: Any, shape: tuple[int, ...]) -> None:
             f"ThicknessMap.std [mm] must be positive and finite, got {known[bad][0]:g} in {_pixels(bad)}; "
             "leave std=None where the noise is not known."
         )
+
+
+class Pile(NamedTuple):
+    """Pixels at the edge of a map's range that hold one number.
+
+    Attributes:
+        value: The number.
+        count: Pixels that hold it.
+        low: Lowest of the other numbers.
+        high: Highest of them.
+        suspicion: What is odd, as in "far from the others".
+        is_refused: Whether it cannot be thickness.
+    """
+
+    value: float
+    count: int
+    low: float
+    high: float
+    suspicion: str
+    is_refused: bool
+
+
+def piles(numbers: np.ndarray) -> list[Pile]:
+    """Find numbers at either end of a map's range that look like a mark for missing pixels, or saturated.
+
+    Args:
+        numbers: The map's numbers in any unit, without missing pixels.
+    """
+    values, counts = np.unique(numbers, return_counts=True)
+    if values.size <= _FEWEST_OTHERS:
+        return []
+    found = (_pile(values, counts, 0), _pile(values, counts, values.size - 1))
+    return [pile for pile in found if pile is not None]
+
+
+def _pile(values: np.ndarray, counts: np.ndarray, end: int) -> Pile | None:
+    others, times = np.delete(values, end).astype(float), np.delete(counts, end)
+    value, count, total = float(values[end]), int(counts[end]), int(counts.sum())
+    low, high = float(others[0]), float(others[-1])
+    gap = max(low - value, value - high)
+
+    def made(suspicion: str, is_refused: bool = False) -> Pile:
+        return Pile(value, count, low, high, suspicion, is_refused)
+
+    if gap > high - low and not low / 2 <= value <= 2 * high:
+        return made("far from", is_refused=count > 1)
+    if count > 1 and value in _FULL_SCALE and end:
+        return made("a full scale beyond")
+    if _FEWEST_ALIKE <= count <= total / 2:
+        if gap > _APART * (high - low):
+            return made("apart from")
+        if count > _TOO_OFTEN * times.max():
+            return made("far more often than any of")
+    return None
+
+
+def off_square(extent: tuple[float, float], shape: tuple[int, ...]) -> float:
+    """Count the rows that a map of (Lx, Ly) has too many, if its pixels are square."""
+    ny, nx = shape
+    return ny - 1 - extent[1] * (nx - 1) / extent[0]

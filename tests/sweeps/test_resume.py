@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.sweep.store import FINISHED, PLAN, POINTS
+from opfem.sweeps.store import FINISHED, PLAN, POINTS
 
 AXES = {"a": np.linspace(0.1, 2.0, 5), "b": np.linspace(0.0, 1.0, 4)}
 FACTOR = 2.0

@@ -135,7 +135,7 @@ class Folder:
             "labels": {name: dataclasses.asdict(label) for name, label in outcome.labels.items()},
         }
         arrays: dict[str, Any] = {f"value {name}": value for name, value in outcome.values.items()}
-        with whole_file(self._path(point)) as temporary:
+        with whole_file(self._path(point), sum(array.nbytes for array in arrays.values())) as temporary:
             np.savez(temporary, record=json.dumps(record), **arrays)
         self._finished.add(point)
 

@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.stats import qmc
 
 import opfem as op
-from opfem.sweep.design import check_arguments, grid
+from opfem.sweeps.design import check_arguments, grid
 
 
 def test_a_grid_holds_every_combination_last_axis_fastest():

@@ -12,8 +12,8 @@ import xarray as xr
 import opfem as op
 from opfem.solvers import CONVERGED
 from opfem.solvers.progress import Progress
-from opfem.sweep.outputs import GOOD
-from opfem.sweep.progress import SweepProgress
+from opfem.sweeps.outputs import GOOD
+from opfem.sweeps.progress import SweepProgress
 from tests.tolerances import ROUNDOFF
 
 MODES = ("map", "vmap", "call")

@@ -158,7 +158,7 @@ def check_arguments(fn: Callable, points: Points) -> None:
         )
 
 
-def known_name(what: str, name: str, known: Any) -> None:
+def known_name(what: str, name: Any, known: Any) -> None:
     """Raise ValueError unless a name is among those known; suggest the nearest."""
     if name not in known:
         near = difflib.get_close_matches(str(name), [str(k) for k in known], n=1)

@@ -27,7 +27,7 @@ _ENDS = {"solve": RESULTS, "fit": FitStatus}
 # Equinox offers no other way from a name to its item.
 _NAMES = {kind: enumeration._name_to_item for kind, enumeration in _ENDS.items()}
 _ELEMENTS = ("y_element", "x_element")
-_FIELDS: dict[str, tuple[tuple[str, ...], str, str, Callable[[Any], Any]]] = {
+FIELDS: dict[str, tuple[tuple[str, ...], str, str, Callable[[Any], Any]]] = {
     "max_pressure": ((), "MPa", "largest contact pressure at the sample", lambda s: jnp.max(s.pressure)),
     "pressure": (NODES, "MPa", "contact pressure at the sample on the current area", lambda s: s.pressure),
     "traction": (("component", *NODES), "MPa", "force on the layer per reference area", lambda s: s.traction),
@@ -153,13 +153,13 @@ class Outputs:
         keep = self.keep if isinstance(self.keep, tuple) else ("pressure", *own, *stats)
         dims: set[str] = set()
         for name in keep:
-            _known("sweep.keep", name, (*_FIELDS, *own, *stats))
+            _known("sweep.keep", name, (*FIELDS, *own, *stats))
             if name in stats:
                 value = jnp.asarray(stats[name][name])
                 unit, about = (STATS | FIT_STATS).get(name, (None, name.replace("_", " ")))
                 label = Label(("component",) if value.shape == (3,) else None, unit, about)
             else:
-                its, unit, about, of = (own | _FIELDS)[name]
+                its, unit, about, of = (own | FIELDS)[name]
                 value, label = of(part if name in own else solution), Label(its, unit, about)
             dims |= set(label.dims or ())
             yield name, value, label

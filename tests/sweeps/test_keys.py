@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.sweep.keys import hash_of
+from opfem.sweeps.keys import hash_of
 
 FACTOR = 2.0
 
@@ -101,7 +101,7 @@ def test_what_has_no_known_content_is_refused(thing):
 def test_every_process_finds_the_same():
     code = """
         import jax.numpy as jnp, opfem as op
-        from opfem.sweep.keys import hash_of
+        from opfem.sweeps.keys import hash_of
         layer = op.Layer(0.5, op.NeoHooke(c10=1e-3, bulk=0.1))
         def fn(x, kinds=frozenset({"one", "two", "three"})):
             return layer.thickness * x, {"a", "b", "c", "d"} , jnp.sin(x), op.solve

@@ -1,0 +1,147 @@
+"""The commands: what each takes and does, as its help says it; each computes in a module of its own.
+
+Those modules load JAX, so they are imported when a command runs.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter
+
+from .messages import say
+from .options import (
+    ContactOptions,
+    FitLayerOptions,
+    FitOptions,
+    ImprintOptions,
+    LayerOptions,
+    MapOptions,
+    RunOptions,
+    SolverOptions,
+    StepOptions,
+)
+from .running import complain, reporting
+
+MISUSED = 2
+
+
+def _version() -> str:
+    from .. import __version__
+
+    return f"opfem {__version__}"
+
+
+app = App(
+    name="opfem",
+    help="Stress on tissue from the measured thickness of a soft layer.",
+    default_parameter=Parameter(negative=()),
+    version=_version,
+)
+app.register_install_completion_command(help="Let the shell complete opfem's commands and options.")
+app["--version"].help = "Show the version of opfem."
+app["--help"].help = "Show this."
+
+_Map = Annotated[
+    str,
+    Parameter(
+        name="MAP",
+        help="Loaded thickness (.mat, .npy, .npz, .tif, .csv), or the word example for a built-in one.",
+    ),
+]
+_Out = Annotated[Path, Parameter(help="Folder of the results.")]
+
+
+def run(tokens: Sequence[str] | None) -> None:
+    """Run a command and exit.
+
+    Args:
+        tokens: Arguments; None takes those of the process.
+    """
+    try:
+        app(tokens, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        complain(say(error))
+        raise SystemExit(MISUSED) from None
+
+
+@app.command
+def palpate(
+    map: _Map,
+    /,
+    *,
+    out: _Out,
+    reading: MapOptions = MapOptions(),
+    layer: LayerOptions = LayerOptions(),
+    contact: ImprintOptions = ImprintOptions(),
+    solver: SolverOptions = SolverOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Compute the stress map of a measured thickness map.
+
+    Writes result.nc, result.vtu, summary.json, pressure.png and report.png.
+    """
+    from .palpate import palpate
+
+    with reporting(run.debug):
+        palpate(map, out, reading, layer, contact, solver, run)
+
+
+@app.command
+def fit(
+    map: _Map,
+    /,
+    *,
+    out: _Out,
+    reading: MapOptions = MapOptions(),
+    layer: FitLayerOptions = FitLayerOptions(),
+    contact: ContactOptions = ContactOptions(),
+    asked: FitOptions = FitOptions(),
+    steps: StepOptions = StepOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Fit the traction on the sample to a measured thickness map, with its uncertainty.
+
+    Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
+    summary.json, pressure.png and fit.png.
+    """
+    from .fit import fit
+
+    with reporting(run.debug):
+        fit(map, out, reading, layer, contact, asked, steps, run)
+
+
+@app.command
+def sweep(
+    config: Annotated[
+        Path, Parameter(name="CONFIG", help="A .toml file with [inputs], [axes] and [outputs]; the README shows one.")
+    ],
+    /,
+    *,
+    out: _Out,
+    resume: Annotated[bool, Parameter(help="Go on with the sweep that --out holds.")] = False,
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Solve for many values of materials, frictions and thickness, as CONFIG says.
+
+    Writes result.nc, labelled by the axes, and every finished point on the way.
+    """
+    from .sweep import sweep
+
+    with reporting(run.debug):
+        sweep(config, out, resume, run)
+
+
+@app.command
+def demo(
+    *,
+    out: _Out = Path("opfem_demo"),
+    coin: Annotated[bool, Parameter(help="Take the published map of a 5-cent coin (downloaded once, GPL-3).")] = False,
+    solver: SolverOptions = SolverOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Show what opfem does: the stress map of a built-in measurement, or of the published coin."""
+    from .palpate import demo
+
+    with reporting(run.debug):
+        demo(out, coin, solver, run)
