@@ -126,7 +126,7 @@ class ContactFace(eqx.Module):
 
     def _carried(self, history: SlipHistory) -> Array | float:
         """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""
-        return self.contact.law.clearance_at(history.pressure, self.stiffness) if self.is_exact else 0.0
+        return 0.0 if self.imposed is not None else self.contact.law.carried(history.pressure, self.stiffness)
 
     def _law(self, history: SlipHistory) -> Callable[[Array], Array]:
         carried = self._carried(history)
@@ -374,7 +374,7 @@ def paired(faces: Sequence[ContactFace]) -> ContactFace:
 
 def can_pair(faces: Sequence[ContactFace]) -> bool:
     """Tell whether contact faces are integrated alike, so that they can be evaluated as one."""
-    alike = {(face.rule, face.contact.law.exact, face.sides is None) for face in faces}
+    alike = {(face.rule, face.sides is None) for face in faces}
     return len(alike) == 1 and all(face.imposed is None for face in faces)
 
 

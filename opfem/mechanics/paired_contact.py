@@ -36,11 +36,6 @@ class PairedLaw(eqx.Module):
 
     parts: tuple[AbstractOverclosure, ...]
 
-    @property
-    def exact(self) -> bool:
-        """Whether their own penetration is to vanish."""
-        return self.parts[0].exact
-
     def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
         return _in_parts([lambda g, part=part: part.pressure_at(g, scale) for part in self.parts], clearance)
@@ -48,6 +43,10 @@ class PairedLaw(eqx.Module):
     def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure."""
         return _in_parts([lambda p, part=part: part.clearance_at(p, scale) for part in self.parts], pressure)
+
+    def carried(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] that each law is shifted by."""
+        return _in_parts([lambda p, part=part: part.carried(p, scale) for part in self.parts], pressure)
 
 
 class PairedContact(eqx.Module):

@@ -43,6 +43,10 @@ class AbstractOverclosure(eqx.Module):
         """Compute the clearance [mm] of a pressure: the inverse of `pressure_at`."""
         raise NotImplementedError
 
+    def carried(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] to shift the law by, so that it gives a pressure without any; 0 unless exact."""
+        return self.clearance_at(pressure, scale) if self.exact else jnp.zeros_like(pressure)
+
     @property
     def zero_pressure_clearance(self) -> Array:
         """Clearance at which pressure starts [mm]."""
