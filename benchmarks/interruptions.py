@@ -22,7 +22,7 @@ from PIL import Image
 
 import opfem as op
 from opfem.cli.folder import RESULT
-from opfem.cli.sweep import _RESULT as SWEEP
+from opfem.cli.sweep import RESULT as SWEEP
 from opfem.io import finish
 
 FULL_MB = 12  # of the tmpfs: an old result, a new one beside it, and little more
@@ -110,7 +110,7 @@ def trial(name: str, disaster: str, moment: float, work: Path, disk: Path, old: 
     """Let a disaster happen at a moment [s]; return the state before and after completion, and what was said."""
     out = disk / "out"
     shutil.rmtree(out, ignore_errors=True)
-    shutil.copytree(work / name, out)
+    shutil.copytree(work / name / name, out)
     process = subprocess.Popen(command(name, NEW, work, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     filler = None
     try:
@@ -139,11 +139,11 @@ def main(commands: list[str], moments: int) -> None:
     print("command  disaster  runs  old  new  neither  neither after completion  said what is needed  seconds")
     try:
         for name in commands:
-            for friction in (NEW, OLD):  # compiles, too; the second is the old result
+            for friction, place in ((NEW, "compiled"), (OLD, name), (NEW, "timed")):
                 begin = time.perf_counter()
-                subprocess.run(command(name, friction, work, work / name), check=True, capture_output=True)
+                subprocess.run(command(name, friction, work, work / place / name), check=True, capture_output=True)
                 took = time.perf_counter() - begin
-            old = visible(work / name)
+            old = visible(work / name / name)
             for disaster in ("kill", "full"):
                 counts: Counter[str] = Counter()
                 for number in range(moments):

@@ -246,9 +246,7 @@ def read_config(path: Path) -> Verdict:
         raise _Accepted(repr(points))
 
     said = io.StringIO()
-    name = "compute" if hasattr(command, "compute") else "computation"
-    real = getattr(command, name)
-    setattr(command, name, stop)
+    real, command.compute = command.compute, stop
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
         try:
             opfem.cli.main(["sweep", str(path), "--out", str(Path(out) / "sweep")])
@@ -265,7 +263,7 @@ def read_config(path: Path) -> Verdict:
         except Exception as cause:  # what the table counts
             return Verdict("traceback", f"{type(cause).__name__}: {cause}")
         finally:
-            setattr(command, name, real)
+            command.compute = real
     return Verdict("traceback", "ended without a word")
 
 

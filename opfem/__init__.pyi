@@ -32,7 +32,11 @@ from .io import (
     write_thickness as write_thickness,
     write_vtu as write_vtu,
 )
-from .measurement import MeasurementError as MeasurementError, ThicknessMap as ThicknessMap
+from .measurement import (
+    MeasurementError as MeasurementError,
+    MeasurementWarning as MeasurementWarning,
+    ThicknessMap as ThicknessMap,
+)
 from .measurement.oct import (
     EDGES as EDGES,
     LAYER as LAYER,

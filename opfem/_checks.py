@@ -4,21 +4,54 @@ A value is checked when it is concrete; a tracer passes, because the solve check
 computes. Every message says field, unit, expected, got.
 """
 
+import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
 
-def as_leaf(value: Any) -> Array:
-    """Convert a number or array to a floating-point leaf; what has no precision of its own gets the default.
+def as_leaf(value: Any, field: str = "value", unit: str = "-") -> Array:
+    """Convert a number or array of any precision and byte order to a leaf of the default one: float64, once it is on.
 
-    The type is stated, so that 0, 0.0 and np.float64(0) share one compilation.
+    The type is stated, so that 0, 0.0, np.float32(0) and np.float64(0) share one compilation.
+
+    Raises:
+        ValueError: If it is no number.
     """
-    array = jnp.asarray(value)
-    return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
+    try:
+        array = value
+        if not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+            array = np.asarray(value)
+            array = array.astype(float) if array.dtype.kind in "fiu" else array
+        array = jnp.asarray(array)
+    except (TypeError, ValueError):
+        array = None
+    if array is None or not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise ValueError(f"{field} [{unit}] must be a number, got {value!r}.")
+    return jnp.asarray(array, float)
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaf:
+    """Converter of a module's field, with the name that messages use and the unit that `repr` writes.
+
+    Attributes:
+        field: Name, such as "NeoHooke.c10".
+        unit: Its unit; "-" for none.
+        optional: Whether it may be None.
+    """
+
+    field: str
+    unit: str
+    optional: bool = False
+
+    def __call__(self, value: Any) -> Any:
+        """Convert a value to a leaf."""
+        return None if value is None and self.optional else as_leaf(value, self.field, self.unit)
 
 
 def concrete(value: Any) -> np.ndarray | None:

@@ -13,12 +13,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "opfem"
 CHAIN = ("measurement", "model", "mechanics", "solvers", "inverse", "results")
-EVERYONE = {"_types", "_checks"}
+EVERYONE = {"_types", "_checks", "_repr"}
 
 MAY_IMPORT = {stage: set(CHAIN[: place + 1]) for place, stage in enumerate(CHAIN)}
 MAY_IMPORT |= {
     "_types": set(),
     "_checks": set(),
+    "_repr": set(),
     "compilation": set(),
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # Arguments and fields of the library, and the options that they come from; others are called as the option is.
 _FIELDS = {
     "Layer.thickness": "--l0",
+    "Imprint.thickness": "MAP",
     "Palpation.extent": "--layer-extent",
     "Contact.friction": "--window-friction or --sample-friction",
     "ExponentialOverclosure.pressure": "--p0",
@@ -32,9 +33,9 @@ _OWNERS = (
     "find_interface|OctVolume|OctSystem"
 )
 _ARGUMENTS = (
-    "unit|extent|spacing|std|variable|missing|mask|scale|elements|element|sides|bulk|c10|c01|increments|duration|"
-    "depth_spacing|index_applied|optical_spacing|shape|order|dtype|edge|search|average|max_slope|confidence|window|"
-    "mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws"
+    "unit|extent|spacing|std|variable|max_missing|max_bytes|missing|mask|scale|elements|element|sides|bulk|c10|c01|"
+    "increments|duration|mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws|"
+    "depth_spacing|index_applied|optical_spacing|shape|order|dtype|edge|search|average|max_slope|confidence|window"
 )
 _FIELD = re.compile("|".join(map(re.escape, _FIELDS)) + rf"|\b(?:{_OWNERS})\.({_ARGUMENTS})\b")
 _CALL = re.compile(rf"\b(?:{_OWNERS})\(({_ARGUMENTS})=\.\.\.\)")

@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -40,7 +41,7 @@ def reporting(debug: bool) -> Iterator[None]:
     """End with a message and an exit status instead of a traceback."""
     interrupts: list[int] = []
     try:
-        with _interruptible(interrupts):
+        with _interruptible(interrupts), _remarks():
             yield
     except KeyboardInterrupt:
         _end_interrupted()
@@ -62,6 +63,24 @@ def complain(message: str) -> None:
     from rich.console import Console
 
     Console(stderr=True, highlight=False).print(f"opfem: {message}", style="bold red", markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _remarks() -> Iterator[None]:
+    """Say what the library warns of as this program says things: in a line, each once, in options."""
+    from rich.console import Console
+
+    said: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        text = in_options(str(message))
+        if text not in said:
+            said.add(text)
+            Console(stderr=True, highlight=False).print(f"opfem: {text}", style="yellow", markup=False, soft_wrap=True)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 def _end_interrupted() -> None:

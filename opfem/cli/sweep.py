@@ -22,6 +22,7 @@ from ..io import finish, take_place
 from ..model import Imprint, Palpation
 from ..results.dataset import STATS
 from ..solvers import Newton, Solution, solve
+from ..solvers.discretise import check_compatible
 from ..solvers.progress import Progress
 from ..sweeps import Batch, sample, sweep as compute, zip_
 from ..sweeps.design import Points, grid, known_name
@@ -33,7 +34,7 @@ from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions
 from .statement import configure_jax, read_maps, state_experiment, state_palpation
 
 # All that a sweep writes, the mark of a finished one last.
-_RESULT = (POINTS, PLAN, FINISHED)
+RESULT = (POINTS, PLAN, FINISHED)
 # Where a sweep is computed that is to take the place of the one in the folder around it.
 _REPLACEMENT = ".opfem-replacement"
 
@@ -63,6 +64,7 @@ _UNITS = {
 }
 _Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
+_MOST_STATED = 200  # points that are checked one by one, a millisecond each
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
 
@@ -99,7 +101,7 @@ def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
         prepare(out)
         data = compute(function, points, keep=keep, execution=execution, out=folder)
         if folder != out:
-            take_place(out, folder, _RESULT)
+            take_place(out, folder, RESULT)
     failed = int(np.sum(~np.isin(data.status, GOOD)))
     console = Console(highlight=False)
     console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
@@ -133,12 +135,12 @@ def _read(config: Path) -> dict[str, Any]:
 
 def _settle(out: Path, resume: bool, force: bool) -> Path:
     """Find the folder to compute in: an old sweep that is to be replaced stays until the new one is complete."""
-    finish(out, _RESULT)
+    finish(out, RESULT)
     begun, replacement = (out / PLAN).exists(), out / _REPLACEMENT
     if (out / FINISHED).exists() and not begun:
         raise FileExistsError(f"--out {out} holds the result of another command. Choose another --out.")
     if force and begun:
-        refuse_links(out, _RESULT)
+        refuse_links(out, RESULT)
         shutil.rmtree(replacement, ignore_errors=True)
         return replacement
     if resume and (replacement / PLAN).exists():
@@ -229,7 +231,8 @@ def _is_log(name: str, axis: Mapping[str, Any]) -> bool:
 def _numbers(name: str, values: Any) -> np.ndarray:
     if not isinstance(values, list):
         raise ValueError(f"[axes] {name} must hold a list of numbers, got {values!r}.")
-    return np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    array = np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    return array if np.isfinite(array).all() else _checked(name, array)  # before numbers are made of infinity
 
 
 def _factor(name: str, axis: Any) -> float:
@@ -257,7 +260,7 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
         known_name("[inputs]", name, tuple(hints))
         if name in points.columns:
             raise ValueError(f"[inputs] {name} is also one of the [axes]. Leave one out.")
-        if name == "l0" and isinstance(value, int | float) and not isinstance(value, bool):
+        if name in ("l0", "missing") and isinstance(value, int | float) and not isinstance(value, bool):
             value = str(value)
         value = _converted(f"[inputs] {name}", _plain(hints[name]), value)
         given[name] = _path(value, folder) if name in ("l0", "map", "mask") else value
@@ -333,6 +336,7 @@ def _function(inputs: _Inputs, points: Points) -> Callable[..., Solution]:
     palpation, thickness = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
     _check_points(inputs, palpation, points)
     load = Imprint(thickness, correct_approach=inputs.contact.correct_approach)
+    check_compatible(palpation, load, None)  # inside jit nothing can
     solver = Newton() if inputs.increments is None else Newton(increments=inputs.increments)
     names = tuple(points.columns)
 
@@ -346,11 +350,16 @@ def _function(inputs: _Inputs, points: Points) -> Callable[..., Solution]:
 
 
 def _check_points(inputs: _Inputs, palpation: Palpation, points: Points) -> None:
-    """State the experiment at every point, which checks its numbers; inside jit nothing can."""
+    """State the experiment at the points, which checks their numbers; inside jit nothing can.
+
+    Of very many points those at the ends of every axis are stated, where numbers go wrong first, and some between.
+    """
     extent = (float(palpation.extent[0]), float(palpation.extent[1]))
     layers, contacts = (tuple(typing.get_type_hints(group)) for group in (LayerOptions, ImprintOptions))
     seen = set()
-    for i in range(len(points)):
+    chosen = set(np.linspace(0, len(points) - 1, min(len(points), _MOST_STATED)).astype(int).tolist())
+    chosen |= {int(end) for column in points.columns.values() for end in (np.argmin(column), np.argmax(column))}
+    for i in sorted(chosen):
         numbers = {name: float(column[i]) for name, column in points.columns.items()}
         unloaded = numbers.get("l0", palpation.layer.thickness)
         for group in ({"l0", *layers}, set(contacts)):  # independent of each other: each combination once

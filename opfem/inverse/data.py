@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_positive
+from .._checks import Leaf, as_leaf, check_finite, check_positive
 
 
 class ForceReading(eqx.Module):
@@ -18,8 +18,8 @@ class ForceReading(eqx.Module):
         ValueError: If the force is not finite or the standard deviation is not positive.
     """
 
-    force: Array = eqx.field(converter=as_leaf)
-    std: Array = eqx.field(converter=as_leaf)
+    force: Array = eqx.field(converter=Leaf("ForceReading.force", "N"))
+    std: Array = eqx.field(converter=Leaf("ForceReading.std", "N"))
 
     def __check_init__(self):
         check_finite("ForceReading.force", "N", self.force)
@@ -44,10 +44,10 @@ class AxialDisplacement(eqx.Module):
     mask: Array
 
     def __init__(self, values, std, mask=None):
-        self.values = as_leaf(values)
+        self.values = as_leaf(values, "AxialDisplacement.values", "mm")
         check_finite("AxialDisplacement.values", "mm", self.values)
-        check_positive("AxialDisplacement.std", "mm", std)
-        self.std = as_leaf(std)
+        self.std = as_leaf(std, "AxialDisplacement.std", "mm")
+        check_positive("AxialDisplacement.std", "mm", self.std)
         self.mask = jnp.zeros(self.values.shape, bool) if mask is None else jnp.asarray(mask)
         for name, part in (("std", self.std), ("mask", self.mask)):
             if part.shape not in ((), self.values.shape):

@@ -10,6 +10,7 @@ from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
 from ..model.deformation import kinematics
 from ..model.material import AbstractMaterial
+from ..model.plausible import check_against_layer
 from ..solvers.compiling import QuickJit
 from .conjugate_gradients import LeastSquares, least_squares
 from .noise import noise_std
@@ -87,8 +88,10 @@ def linear_estimate(palpation: Palpation, thickness: ThicknessMap, prior: Abstra
     Raises:
         ValueError: If the map's std is missing or not positive.
     """
+    std = noise_std("linear_estimate", thickness)
+    check_against_layer("linear_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent, 3)
     mesh = palpation.mesh()
-    observation = observe(mesh, thickness, noise_std("linear_estimate", thickness))
+    observation = observe(mesh, thickness, std)
     white = solve_linear(palpation, observation, prior).x
     normal = on_nodes(prior, white.shape) + prior.expand(white, mesh.spacing)
     heights = mesh.thickness - from_cosines(response(palpation, jnp.mean(mesh.thickness)) * cosine_transform(normal))
@@ -104,6 +107,7 @@ def uniaxial_estimate(palpation: Palpation, thickness: ThicknessMap) -> Nodes:
     Source:
         Kennedy et al., Optics Letters 39 (2014) 3014: the layer's local strain and its stress–strain curve.
     """
+    check_against_layer("uniaxial_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent, 3)
     mesh = palpation.mesh()
     stretch = thickness.sample(*mesh.plane()) / mesh.thickness
     return -uniaxial_stress(palpation.layer.material, stretch)

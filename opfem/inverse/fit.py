@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
+from .._checks import as_leaf
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
@@ -126,19 +127,22 @@ def fit_traction(
             the layer, the prior's length is below the mesh, a parameter is unknown, or numbers are float32.
         FitError: If the fit fails and `throw` is True.
     """
-    require_float64(palpation)
     parameters = dict(sorted((parameters or {}).items()))  # as every PyTree has them
     maps = as_tuple(thickness)
-    check_inputs(palpation, maps, prior, lateral, parameters)
+    if lateral is not None and not isinstance(lateral, AbstractPrior):
+        lateral = as_leaf(lateral, "fit_traction.lateral", "MPa")
+    inputs = {"palpation": palpation, "thickness": maps, "prior": prior, "parameters": parameters, "lateral": lateral}
+    require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=solver.as_leaves())
+    check_inputs(palpation, maps, prior, lateral, parameters, as_tuple(inside))
     several = not isinstance(thickness, ThicknessMap)
-    observations = _observe(palpation.mesh(), *stacked_maps(maps), jnp.asarray(model_std, float))
+    observations = _observe(palpation.mesh(), *stacked_maps(maps), as_leaf(model_std, "fit_traction.model_std", "mm"))
     check_covered(maps, observations)
     misfit = Misfit(
         palpation=palpation,
         observations=observations,
         prior=prior,
         lateral=lateral if isinstance(lateral, AbstractPrior) else None,
-        known_lateral=None if lateral is None or isinstance(lateral, AbstractPrior) else jnp.asarray(lateral),
+        known_lateral=None if isinstance(lateral, AbstractPrior) else lateral,
         parameters=parameters,
         forces=stacked("forces", forces, len(maps)),
         inside=stacked("inside", inside, len(maps)),
@@ -206,7 +210,8 @@ class _Run:
             jnp.asarray(_CG_NEGLIGIBLE),
             jnp.asarray(misfit.hopeless),
         )
-        gauss_newton = GaussNewton(rtol=jnp.asarray(self.rtol), atol=jnp.asarray(self.rtol), descent=descent)
+        # `atol` is a property, which optimistix declares as an argument.
+        gauss_newton = GaussNewton(rtol=jnp.asarray(self.rtol), descent=descent)  # pyright: ignore[reportCallIssue]
         state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
         for _ in range(self.max_steps):
@@ -321,7 +326,6 @@ def _result(reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKe
     pressures = _pressure_deviations(solutions, deviations, jnp.stack(moves))
     residual = reached.point.heights - misfit.observations.surface
     points, widths = resolution(reached.posterior, misfit)
-    numbers = {name: jnp.stack([white.numbers[name] for white in whites]) for name in misfit.parameters}
     solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
 
     def one_or_all(v):
@@ -338,7 +342,6 @@ def _result(reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKe
         resolution_points=points,
         resolution_width=one_or_all(widths),
         deviations=deviations if several else deviations[:, 0],
-        number_deviations=numbers,
         number_covariance=number_covariance(reached.posterior),
         misfit=misfit,
         posterior=reached.posterior,

@@ -12,6 +12,7 @@ from ..solvers.derivative import Handed, Slot, Solve, follow_path, linearise, pu
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
 from ..solvers.newton import Newton
+from ..solvers.solution import judged
 from ..solvers.solve import compiled_attempt, finish, prepare
 from ..solvers.stepping import Stepping, attempt, begin, unfinished
 
@@ -49,7 +50,7 @@ class Way(NamedTuple):
 
     def solution(self, solver: Newton) -> Solution:
         """Return the solution, first finding it where the solve was given up because of its length."""
-        return finish(self.problem, to_the_end(self.problem, self.end, solver), self.palpation, self.load)
+        return judged(finish(self.problem, to_the_end(self.problem, self.end, solver), self.palpation, self.load))
 
 
 def press(palpation: Palpation, load: Traction, solver: Newton) -> Way:

@@ -11,6 +11,8 @@ from jaxtyping import Array
 from .._checks import concrete
 from ..measurement import ThicknessMap
 from ..model import Contact, Palpation
+from ..model.plausible import check_against_layer
+from .data import AxialDisplacement
 from .noise import noise_std
 from .observation import Observation
 from .parameters import check_parameters
@@ -18,7 +20,9 @@ from .prior import AbstractPrior, Matern
 
 
 def as_tuple(value: Any) -> tuple:
-    """Make one thing a sequence of one."""
+    """Make one thing a sequence of one; of nothing, an empty one."""
+    if value is None:
+        return ()
     return tuple(value) if isinstance(value, Sequence) else (value,)
 
 
@@ -40,7 +44,12 @@ def stacked_maps(maps: tuple[ThicknessMap, ...]) -> tuple[ThicknessMap, Array]:
 
 
 def check_inputs(
-    palpation: Palpation, maps: tuple[ThicknessMap, ...], prior: Any, lateral: Any, parameters: Mapping[str, Any]
+    palpation: Palpation,
+    maps: tuple[ThicknessMap, ...],
+    prior: Any,
+    lateral: Any,
+    parameters: Mapping[str, Any],
+    inside: tuple[AxialDisplacement, ...],
 ) -> None:
     """Refuse what a fit cannot work with."""
     if not isinstance(palpation.sample, Contact):
@@ -56,10 +65,19 @@ def check_inputs(
             f"fit_traction.thickness must be one map, or several on one grid of pixels, got shapes "
             f"{[m.shape for m in maps]}."
         )
+    for m in maps:
+        check_against_layer("fit_traction.thickness", m, palpation.layer.thickness, palpation.extent, 4)
     check_parameters(palpation, parameters)
-    nx, ny, _ = palpation.elements
+    nx, ny, nz = palpation.elements
     if min(nx, ny) < 4:
         raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")
+    for one in inside:
+        if not isinstance(one, AxialDisplacement) or one.values.shape != (nz + 1, ny + 1, nx + 1):
+            got = f"shape {one.values.shape}" if isinstance(one, AxialDisplacement) else type(one).__name__
+            raise ValueError(
+                f"fit_traction.inside [mm] must be AxialDisplacement(values, std) at the mesh's nodes "
+                f"(nz+1, ny+1, nx+1) = {(nz + 1, ny + 1, nx + 1)}, one for each map; got {got}."
+            )
     if lateral is not None and not isinstance(lateral, AbstractPrior):
         if np.shape(lateral) != (2, ny + 1, nx + 1) or not np.all(np.isfinite(lateral)):
             raise ValueError(

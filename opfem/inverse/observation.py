@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .._types import Map, ScalarLike
 from ..measurement import ThicknessMap
+from ..mechanics.interface_point import locate
 from ..model import HeightField, LayerMesh
 
 Nodes = Float[Array, "my mx"]
@@ -20,13 +21,6 @@ Nodes = Float[Array, "my mx"]
 _PER_FWHM = 1.0 / np.sqrt(8.0 * np.log(2.0))
 # Stiffness of the splines between pixels, over the mean precision of a node: what masked nodes follow.
 _BENDING = 1e-6
-# Steps to find which point of the interface lies at a place. The first go half of the way that is left, which comes
-# near unless fibres are four times as long as they were (1.7 times at a side that bulges); as many follow by Newton's
-# method, for which the interface counts as folded where it covers less than this part of its area.
-_LOCATING_STEPS = 20
-_FOLDED = 1e-3
-# How near the search must come, in elements, for the place to count as found.
-_FOUND = 1e-6
 # Pixels this far outside, in elements, still lie on the layer: round-off of its edge.
 _ON_EDGE = 1e-9
 
@@ -123,40 +117,19 @@ def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
     """
     (hx, hy), (my, mx) = mesh.spacing, mesh.thickness.shape
     to_y, to_x = (jnp.asarray(_interpolation(n)) for n in (my, mx))
-    place = jnp.stack(mesh.plane())
-    far = jnp.stack([hx * (mx - 1), hy * (my - 1)])[:, None, None]
 
     def spline(values):
         return HeightField(to_y @ values @ to_x.T, jnp.stack([-hx, -hy]), jnp.stack([hx, hy]), "cubic")
 
-    moved, height = jax.vmap(spline)(u[:2]), spline(mesh.thickness + u[2])
-    frozen = jax.lax.stop_gradient(moved)
+    motion = jax.tree_util.Partial(_both, jax.vmap(spline)(u[:2]))
+    place, far = jnp.stack(mesh.plane()), jnp.stack([hx * (mx - 1), hy * (my - 1)])
+    below = locate(motion, place, far, jnp.stack([hx, hy]))
+    return spline(mesh.thickness + u[2])(*below.at)[0]
 
-    def newton(at, fields, counts):
-        """Say what is left of the way, and the step that Newton's method takes along the axes that count."""
-        values, slope_x, slope_y = jax.vmap(lambda field: field(*at))(fields)
-        off = place - at - values
-        counted = jax.lax.stop_gradient(counts(at, off))
-        off = jnp.where(counted, off, 0.0)
-        (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(counted, slope, 0.0)) for slope in (slope_x, slope_y))
-        determinant = (1.0 + a) * (1.0 + d) - b * c
-        determinant = jnp.where(determinant > _FOLDED, determinant, 1.0)
-        return off, jnp.stack([(1.0 + d) * off[0] - b * off[1], (1.0 + a) * off[1] - c * off[0]]) / determinant
 
-    def on_layer(at, off):
-        return ((at > 0.0) | (off > 0.0)) & ((at < far) | (off < 0.0))
-
-    def found(_, off):
-        return jnp.abs(off) < _FOUND * jnp.stack([hx, hy])[:, None, None]
-
-    def closer(count, at):
-        off, step = newton(at, frozen, on_layer)
-        return jnp.clip(at + jnp.where(count < _LOCATING_STEPS, 0.5 * off, step), 0.0, far)
-
-    at = jax.lax.fori_loop(0, 2 * _LOCATING_STEPS, closer, place)
-    # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
-    at = jax.lax.fori_loop(0, 2, lambda _, at: at + newton(at, moved, found)[1], at)
-    return height(*at)[0]
+def _both(fields: HeightField, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Evaluate several fields, stacked, and their slopes."""
+    return jax.vmap(lambda field: field(x, y))(fields)
 
 
 def _spline_values(t: Float[Array, " points"], cells: int) -> tuple[Array, Array]:

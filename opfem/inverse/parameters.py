@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_finite, check_positive
+from .._checks import Leaf, as_leaf, check_finite, check_positive
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..model import Palpation
@@ -37,8 +37,8 @@ class Normal(AbstractNumberPrior):
         ValueError: If the mean is not finite or the standard deviation is not positive.
     """
 
-    mean: Array = eqx.field(converter=as_leaf)
-    std: Array = eqx.field(converter=as_leaf)
+    mean: Array = eqx.field(converter=Leaf("Normal.mean", "the number's unit"))
+    std: Array = eqx.field(converter=Leaf("Normal.std", "the number's unit"))
 
     def __check_init__(self):
         check_finite("Normal.mean", "the number's unit", self.mean)
@@ -60,8 +60,8 @@ class LogNormal(AbstractNumberPrior):
         ValueError: If one is not positive.
     """
 
-    median: Array = eqx.field(converter=as_leaf)
-    spread: Array = eqx.field(converter=as_leaf)
+    median: Array = eqx.field(converter=Leaf("LogNormal.median", "the number's unit"))
+    spread: Array = eqx.field(converter=Leaf("LogNormal.spread", "-"))
 
     def __check_init__(self):
         check_positive("LogNormal.median", "the number's unit", self.median)
@@ -81,7 +81,7 @@ def with_numbers(palpation: Palpation, numbers: Mapping[str, ScalarLike]) -> Pal
     """
     for name, value in numbers.items():
         if name not in (INDEX, OFFSET):
-            palpation = eqx.tree_at(lambda p, name=name: _field(p, name), palpation, jnp.asarray(value))
+            palpation = eqx.tree_at(lambda p, name=name: _field(p, name), palpation, as_leaf(value, name))
     thickness = palpation.layer.thickness
     values = thickness.values if isinstance(thickness, ThicknessMap) else thickness
     changed = (values + numbers.get(OFFSET, 0.0)) / numbers.get(INDEX, 1.0)

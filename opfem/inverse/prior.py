@@ -12,7 +12,7 @@ import jax.scipy.fft
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_positive
+from .._checks import Leaf, check_finite, check_positive
 from .._types import ScalarLike
 from .transfer import wave_numbers
 
@@ -87,10 +87,10 @@ class Matern(AbstractPrior):
         Rasmussen & Williams, Gaussian Processes for Machine Learning, section 4.2.
     """
 
-    length: Array = eqx.field(converter=as_leaf)
-    std: Array = eqx.field(converter=as_leaf)
-    smoothness: Array = eqx.field(converter=as_leaf, default=1.5)
-    mean: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    length: Array = eqx.field(converter=Leaf("Matern.length", "mm"))
+    std: Array = eqx.field(converter=Leaf("Matern.std", "MPa"))
+    smoothness: Array = eqx.field(converter=Leaf("Matern.smoothness", "-"), default=1.5)
+    mean: Array | None = eqx.field(converter=Leaf("Matern.mean", "MPa", optional=True), default=None)
 
     def __check_init__(self):
         check_positive("Matern.length", "mm", self.length)
@@ -133,8 +133,8 @@ class Tikhonov(AbstractPrior):
     """
 
     order: int = eqx.field(static=True)
-    weight: Array = eqx.field(converter=as_leaf)
-    mean: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    weight: Array = eqx.field(converter=Leaf("Tikhonov.weight", "mm^(order-1)/MPa"))
+    mean: Array | None = eqx.field(converter=Leaf("Tikhonov.mean", "MPa", optional=True), default=None)
 
     def __check_init__(self):
         if self.order not in (1, 2):
@@ -179,9 +179,9 @@ class TotalVariation(AbstractPrior):
         Rudin, Osher & Fatemi, Physica D 60 (1992) 259, smoothed as in Vogel & Oman, SIAM J. Sci. Comput. 17 (1996) 227.
     """
 
-    weight: Array = eqx.field(converter=as_leaf)
-    slope: Array = eqx.field(converter=as_leaf)
-    mean: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    weight: Array = eqx.field(converter=Leaf("TotalVariation.weight", "1/(MPa mm)"))
+    slope: Array = eqx.field(converter=Leaf("TotalVariation.slope", "MPa/mm"))
+    mean: Array | None = eqx.field(converter=Leaf("TotalVariation.mean", "MPa", optional=True), default=None)
 
     def __check_init__(self):
         check_positive("TotalVariation.weight", "1/(MPa mm)", self.weight)

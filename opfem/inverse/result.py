@@ -74,9 +74,8 @@ class TractionFit(eqx.Module):
             That of the Gaussian of the same peak and sum of squares, full width at half maximum: 1.3 elements where
             the mesh itself is the limit.
         deviations: Draws of the normal traction minus the optimum, which standard deviations come from [MPa].
-        number_deviations: The same of fitted numbers, of their white unknowns [-], by name.
-        number_covariance: Posterior covariance of those white unknowns, each of variance 1 before the fit, in the order
-            of `numbers` [-].
+        number_covariance: Posterior covariance of the white unknowns of fitted numbers, each of variance 1 before the
+            fit, in the order of `numbers` [-].
         misfit: What was minimised, with the prior as chosen.
         posterior: The posterior of the white unknowns.
         stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (each one product with the Jacobian and one
@@ -97,7 +96,6 @@ class TractionFit(eqx.Module):
     resolution_points: Float[np.ndarray, "points 2"]
     resolution_width: Float[np.ndarray, "*maps points"]
     deviations: Array
-    number_deviations: dict[str, Float[Array, " draws"]]
     number_covariance: Float[Array, "numbers numbers"]
     misfit: Misfit
     posterior: Posterior

@@ -83,5 +83,5 @@ def check_size(shape: tuple[int, ...], item: int, max_bytes: int) -> None:
     if size > max_bytes:
         raise MeasurementError(
             f"an array of shape {shape} takes {size / 1e6:.0f} MB once loaded, above max_bytes={max_bytes}; "
-            "if the file is meant to hold so much, pass a larger max_bytes=."
+            "pass a larger max_bytes= if the file is meant to hold so much."
         )

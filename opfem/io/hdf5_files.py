@@ -89,6 +89,7 @@ def _entry(reading: Reading, node: h5py.Group | h5py.Dataset, matlab: bool) -> E
         with h5py.File(reading.path, "r") as file:
             stored = file[name]
             assert isinstance(stored, h5py.Dataset)
+            check_size(stored.chunks or (), item, reading.max_bytes)
             _check_inflation(stored, reading.max_bytes)
             array = np.asarray(stored)
         return array.T if matlab else array

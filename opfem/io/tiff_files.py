@@ -66,27 +66,40 @@ class _Notes(logging.Handler):
 def _image(reading: Reading, file: tifffile.TiffFile, index: int) -> Entry:
     series = file.series[index]
     page = series.keyframe
+    assert isinstance(page, tifffile.TiffPage)
     if page.samplesperpixel > 1:
         return other("a colour image: it shows numbers but does not hold them", series.shape)
     kind = kind_of(series.dtype) if series.dtype is not None else "of an unknown type"
     item = series.dtype.itemsize if series.dtype is not None else 1
-    stored = sum(page.databytecounts)
-    if page.compression == tifffile.COMPRESSION.NONE and stored != page.nbytes:
-        raise MeasurementError(f"an image of shape {page.shape} takes {page.nbytes} bytes, the file holds {stored}.")
+    _check_stored(page, item)
     shape, offset, slope = series.shape, *_calibration(file)
 
     def load() -> np.ndarray:
         check_size(shape, item, reading.max_bytes)
         with _open(reading) as again:
-            _check_inflation(reading, again.series[index])
+            tile = (page.tilelength, page.tilewidth) if page.is_tiled else ()
+            check_size(tile, item, reading.max_bytes)
+            _check_inflation(reading, again.series[index], max(page.nbytes, math.prod(tile) * item))
             pixels = _decoded(reading, again.series[index])
         return pixels if (offset, slope) == (0, 1) else offset + slope * pixels.astype(float)
 
     return Entry(kind, shape, load, spacing=_spacing(reading, file, index))
 
 
-def _check_inflation(reading: Reading, series: tifffile.TiffPageSeries) -> None:
-    """Refuse compressed strips that hold more than their whole image."""
+def _check_stored(page: tifffile.TiffPage, item: int) -> None:
+    """Refuse an uncompressed image that states another size than it has, by a row or a column at least."""
+    if page.compression != tifffile.COMPRESSION.NONE:
+        return
+    stored, stated = sum(page.databytecounts), page.nbytes
+    if page.is_tiled:
+        tiles = -(-page.imagelength // page.tilelength) * -(-page.imagewidth // page.tilewidth)
+        stated = tiles * page.tilelength * page.tilewidth * item
+    if not 0 <= stored - stated < min(page.shape) * item:
+        raise MeasurementError(f"an image of shape {page.shape} takes {stated} bytes, the file holds {stored}.")
+
+
+def _check_inflation(reading: Reading, series: tifffile.TiffPageSeries, largest: int) -> None:
+    """Refuse compressed strips or tiles of more than `largest` bytes, those of the image or of a whole tile."""
     page = series.keyframe
     inflater = _INFLATERS.get(page.compression)
     if inflater is None:
@@ -94,8 +107,8 @@ def _check_inflation(reading: Reading, series: tifffile.TiffPageSeries) -> None:
     with open(reading.path, "rb") as file:
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)
-            if len(inflater().decompress(file.read(count), page.nbytes + 1)) > page.nbytes:
-                raise MeasurementError(f"is damaged: a strip of an image of {page.nbytes} bytes inflates to more.")
+            if len(inflater().decompress(file.read(count), largest + 1)) > largest:
+                raise MeasurementError(f"is damaged: a part of an image inflates to more than its {largest} bytes.")
 
 
 def _decoded(reading: Reading, series: tifffile.TiffPageSeries) -> np.ndarray:

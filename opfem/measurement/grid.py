@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._checks import concrete
+from .._checks import as_leaf, concrete
 from .._types import Pair, Points, ScalarLike
 
 LENGTH_UNITS = {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "m": 1e3}  # both code points of µ
@@ -46,9 +46,9 @@ class AbstractGrid(eqx.Module):
         return self.origin[1] + self.spacing[1] * jnp.arange(self.shape[0])
 
 
-def pair(field: str, value: Any, dtype: Any) -> Pair:
+def pair(field: str, value: Any) -> Pair:
     """Convert one or two lengths [mm] to (x, y); `field` names them in the error."""
-    numbers = jnp.asarray(value, dtype)
+    numbers = as_leaf(value, field, "mm")
     if numbers.shape not in ((), (2,)):
         raise ValueError(f"{field} [mm] must be two numbers, got shape {numbers.shape}.")
     return jnp.broadcast_to(numbers, (2,))

@@ -9,9 +9,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import wadler_lindig as wl
 from jaxtyping import Array
 
 from .._checks import as_leaf, check_non_negative, check_positive, concrete
+from .._repr import quantity
 from .._types import Map, Mask, Pair, Points, Scalar, ScalarLike
 from .checks import check_grid, check_map_shape, check_mask, check_std, check_thickness
 from .filtering import WHITE_NOISE_LENGTH, smooth, smoothed_variance
@@ -101,7 +103,7 @@ class ThicknessMap(AbstractGrid):
             ValueError: For a wrong shape; NaN, infinite, or unmasked non-positive thickness; a range that
                 suggests another unit; both or neither of `extent` and `spacing`.
         """
-        self.values = as_leaf(values)
+        self.values = as_leaf(values, "ThicknessMap.values", "mm")
         check_map_shape(self.values)
         shape, dtype = self.values.shape, self.values.dtype
         if (extent is None) == (spacing is None):
@@ -112,14 +114,15 @@ class ThicknessMap(AbstractGrid):
             )
         if extent is None:
             steps_between = jnp.array([shape[1] - 1, shape[0] - 1], dtype)
+            spacing = pair("ThicknessMap.spacing (dx, dy)", spacing)
             check_positive("ThicknessMap.spacing (dx, dy)", "mm", spacing)
-            self.extent = pair("ThicknessMap.spacing (dx, dy)", spacing, dtype) * steps_between
+            self.extent = spacing * steps_between
         else:
-            self.extent = pair("ThicknessMap.extent (Lx, Ly)", extent, dtype)
-        self.origin = pair("ThicknessMap.origin (x, y)", origin, dtype)
+            self.extent = pair("ThicknessMap.extent (Lx, Ly)", extent)
+        self.origin = pair("ThicknessMap.origin (x, y)", origin)
         self.mask = jnp.zeros(shape, bool) if mask is None else jnp.asarray(mask)
-        self.std = None if std is None else jnp.asarray(std, dtype)
-        self.noise_length = jnp.asarray(noise_length, dtype)
+        self.std = None if std is None else as_leaf(std, "ThicknessMap.std", "mm")
+        self.noise_length = as_leaf(noise_length, "ThicknessMap.noise_length", "mm")
         self.steps = steps
         self.is_filled = is_filled
         check_grid(self.extent, self.origin)
@@ -128,6 +131,21 @@ class ThicknessMap(AbstractGrid):
         check_non_negative("ThicknessMap.noise_length", "mm", self.noise_length)
         if self.std is not None:
             check_std(self.std, self.mask, shape)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        del options
+        values, mask = concrete(self.values), concrete(self.mask)
+        if values is None or mask is None or values.ndim != 2 or mask.all():
+            return None  # traced or stacked: as equinox writes it
+        low, high = values[~mask].min(), values[~mask].max()
+        span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+        parts = [f"{values.shape[1]} × {values.shape[0]} pixels", f"{span} mm"]
+        for name in ("extent", "origin", "std", "noise_length"):
+            part = getattr(self, name)
+            if part is not None and (concrete(part) is None or np.any(part)):
+                parts.append(f"{name} {quantity(part, 'mm')}")
+        parts += [f"{mask.sum()} missing{' and filled' if self.is_filled else ''}"] if mask.any() else []
+        return wl.TextDoc(f"ThicknessMap({', '.join(parts)})")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -279,10 +297,7 @@ class ThicknessMap(AbstractGrid):
             got = "neither" if shape is None else "both"
             raise ValueError(f"resampled needs either spacing=(dx, dy) [mm] or shape=(ny, nx), got {got}.")
         if shape is None:
-            sides, step = (
-                concrete(self.extent),
-                concrete(pair("resampled.spacing (dx, dy)", spacing, self.values.dtype)),
-            )
+            sides, step = concrete(self.extent), concrete(pair("resampled.spacing (dx, dy)", spacing))
             if sides is None or step is None:
                 raise ValueError("resampled(spacing=) needs known numbers; under jit or vmap pass shape=(ny, nx).")
             check_positive("resampled.spacing (dx, dy)", "mm", step)

@@ -126,17 +126,17 @@ class ContactFace(eqx.Module):
 
     def _carried(self, history: SlipHistory) -> Array | float:
         """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""
-        return self.contact.law.clearance(history.pressure, self.stiffness) if self.is_exact else 0.0
+        return 0.0 if self.imposed is not None else self.contact.law.carried(history.pressure, self.stiffness)
 
     def _law(self, history: SlipHistory) -> Callable[[Array], Array]:
         carried = self._carried(history)
-        return lambda clearance: self.contact.law.pressure(clearance + carried, self.stiffness)
+        return lambda clearance: self.contact.law.pressure_at(clearance + carried, self.stiffness)
 
     def missed_gap(self, before: SlipHistory, after: SlipHistory) -> Array:
         """Compute the largest gap or penetration [mm] that an increment left to exact contact; 0 for other laws."""
         if not self.is_exact:
             return jnp.zeros_like(after.dissipated)
-        gap = self.contact.law.clearance(after.pressure - before.pressure, self.stiffness)
+        gap = self.contact.law.clearance_at(after.pressure - before.pressure, self.stiffness)
         return jnp.max(jnp.where(after.pressure > 0, jnp.abs(gap), 0.0))
 
     def _pressure(self, points: FacePoints, clearance: Array, law) -> tuple[Array, Array, Array, Array]:
@@ -170,7 +170,7 @@ class ContactFace(eqx.Module):
         most = 1e-3 * self.stiffness * self.element_size
         law = self._law(history)
         pressure = jnp.maximum(iterate.pressure, jnp.minimum(law(clearance), most))
-        at = self.contact.law.clearance(pressure, self.stiffness) - self._carried(history)
+        at = self.contact.law.clearance_at(pressure, self.stiffness) - self._carried(history)
         slope = jax.jvp(law, (at,), (jnp.ones_like(at),))[1]
         # Whether a point opens is decided with the layer's own stiffness: the stiff law's would
         # open half of a face at the first micrometre of error.
@@ -374,7 +374,7 @@ def paired(faces: Sequence[ContactFace]) -> ContactFace:
 
 def can_pair(faces: Sequence[ContactFace]) -> bool:
     """Tell whether contact faces are integrated alike, so that they can be evaluated as one."""
-    alike = {(face.rule, face.contact.law.exact, face.sides is None) for face in faces}
+    alike = {(face.rule, face.sides is None) for face in faces}
     return len(alike) == 1 and all(face.imposed is None for face in faces)
 
 

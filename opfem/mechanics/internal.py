@@ -114,10 +114,14 @@ class SolidBody(eqx.Module):
 
         `reduced` has one point to a cell. The energy leaves out what holds its hourglass modes.
         """
-        k, _ = self._measured(self.cells, self.cells.displacement_gradient(u))
+        k = self.kinematics(u)
         P = self.material.first_piola(k, self._mean_stress(self.cells, k, mean_stress))
         cauchy = sum(P[:, j, None] * k.F[None, :, j] for j in range(3)) / k.J
         return k.F, cauchy, self._energy_density(k, mean_stress)
+
+    def kinematics(self, u: Array) -> Kinematics:
+        """Compute the kinematics at the points of `fields`."""
+        return self._measured(self.cells, self.cells.displacement_gradient(u))[0]
 
     def field_volume(self) -> Array:
         """Compute the reference volume [mm³] that each value of `fields` stands for."""

@@ -36,18 +36,17 @@ class PairedLaw(eqx.Module):
 
     parts: tuple[AbstractOverclosure, ...]
 
-    @property
-    def exact(self) -> bool:
-        """Whether their own penetration is to vanish."""
-        return self.parts[0].exact
-
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
-        return _in_parts([lambda g, part=part: part.pressure(g, scale) for part in self.parts], clearance)
+        return _in_parts([lambda g, part=part: part.pressure_at(g, scale) for part in self.parts], clearance)
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure."""
-        return _in_parts([lambda p, part=part: part.clearance(p, scale) for part in self.parts], pressure)
+        return _in_parts([lambda p, part=part: part.clearance_at(p, scale) for part in self.parts], pressure)
+
+    def carried(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] that each law is shifted by."""
+        return _in_parts([lambda p, part=part: part.carried(p, scale) for part in self.parts], pressure)
 
 
 class PairedContact(eqx.Module):

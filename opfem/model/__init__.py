@@ -18,5 +18,6 @@ from .overclosure import (
     TabularOverclosure as TabularOverclosure,
 )
 from .palpation import Palpation as Palpation
+from .stability import extreme_stretches as extreme_stretches, unstable_stretch as unstable_stretch
 from .stretch_material import Hencky as Hencky, Ogden as Ogden
 from .surface import HeightField as HeightField, height_field as height_field

@@ -1,10 +1,13 @@
 """What holds a face of the layer: bonded, roller, or contact with Coulomb friction."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_non_negative, check_positive
+from .._checks import Leaf, check_non_negative, check_positive
+from .._repr import with_units
 from .overclosure import AbstractOverclosure
 
 # Abaqus's default slip tolerance: elastic slip over element size.
@@ -37,24 +40,23 @@ class Contact(eqx.Module):
     """
 
     law: AbstractOverclosure
-    friction: Array = eqx.field(converter=as_leaf)
-    elastic_slip: Array | None
-    stick_slope: Array | None
+    friction: Array = eqx.field(converter=Leaf("Contact.friction", "-"))
+    elastic_slip: Array | None = eqx.field(converter=Leaf("Contact.elastic_slip", "mm", optional=True), default=None)
+    stick_slope: Array | None = eqx.field(converter=Leaf("Contact.stick_slope", "MPa/mm", optional=True), default=None)
 
-    def __init__(self, law: AbstractOverclosure, friction, elastic_slip=None, stick_slope=None):
-        if not isinstance(law, AbstractOverclosure):
-            raise ValueError(f"Contact.law must be an overclosure law such as HardOverclosure(), got {law!r}.")
-        check_non_negative("Contact.friction", "-", friction)
-        if elastic_slip is not None and stick_slope is not None:
+    def __check_init__(self):
+        if not isinstance(self.law, AbstractOverclosure):
+            raise ValueError(f"Contact.law must be an overclosure law such as HardOverclosure(), got {self.law!r}.")
+        check_non_negative("Contact.friction", "-", self.friction)
+        if self.elastic_slip is not None and self.stick_slope is not None:
             raise ValueError("Contact takes elastic_slip [mm] or stick_slope [MPa/mm], got both. Pass one.")
-        if elastic_slip is not None:
-            check_positive("Contact.elastic_slip", "mm", elastic_slip)
-        if stick_slope is not None:
-            check_positive("Contact.stick_slope", "MPa/mm", stick_slope)
-        self.law = law
-        self.friction = as_leaf(friction)
-        self.elastic_slip = None if elastic_slip is None else as_leaf(elastic_slip)
-        self.stick_slope = None if stick_slope is None else as_leaf(stick_slope)
+        if self.elastic_slip is not None:
+            check_positive("Contact.elastic_slip", "mm", self.elastic_slip)
+        if self.stick_slope is not None:
+            check_positive("Contact.stick_slope", "MPa/mm", self.stick_slope)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def slip_limit(self, pressure: Array, element_size: Array) -> Array:
         """Compute the elastic slip [mm] at which a point starts to slide."""

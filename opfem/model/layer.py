@@ -1,12 +1,16 @@
 """The silicone layer: its unloaded thickness and its material."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_positive
+from .._repr import with_units
 from ..measurement import ThicknessMap
 from .material import AbstractMaterial
+from .plausible import check_unloaded
 
 
 class Layer(eqx.Module):
@@ -17,10 +21,10 @@ class Layer(eqx.Module):
         material: Hyperelastic law with an explicit bulk modulus.
 
     Raises:
-        ValueError: If the thickness is not positive, or is a bare array without its extent.
+        ValueError: If the thickness is not positive, not within 0.02 to 20 mm, or is a bare array without its extent.
     """
 
-    thickness: Array | ThicknessMap
+    thickness: Array | ThicknessMap = eqx.field(metadata={"unit": "mm"})
     material: AbstractMaterial
 
     def __init__(self, thickness, material: AbstractMaterial):
@@ -32,10 +36,14 @@ class Layer(eqx.Module):
                     f"Layer.thickness [mm] must be a number or a ThicknessMap, got an array of shape "
                     f"{np.shape(thickness)}. Pass ThicknessMap(values, extent=(Lx, Ly))."
                 )
+            thickness = as_leaf(thickness, "Layer.thickness", "mm")
             check_positive("Layer.thickness", "mm", thickness)
-            thickness = as_leaf(thickness)
+        check_unloaded(thickness)
         self.thickness = thickness
         self.material = material
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def thickness_at(self, x: Float[Array, "*shape"], y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Sample the unloaded thickness [mm] at positions [mm]."""

@@ -1,12 +1,13 @@
 """Loads: what the sample does to the layer at the interface."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_finite, check_non_negative, concrete
+from .._checks import Leaf, check_finite, check_non_negative, concrete
+from .._repr import with_units
 from ..measurement import ThicknessMap
 from .surface import INTERPOLATIONS, Interpolation
 
@@ -45,6 +46,9 @@ class Imprint(eqx.Module):
         if self.interpolation not in INTERPOLATIONS:
             raise ValueError(f"Imprint.interpolation must be one of {INTERPOLATIONS}, got {self.interpolation!r}.")
 
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
+
 
 class Traction(eqx.Module):
     """Apply a load to the interface: force on the layer per reference area, fixed axes.
@@ -64,9 +68,9 @@ class Traction(eqx.Module):
         ValueError: If a value is not finite, a shape is wrong, or the stiffness is negative.
     """
 
-    normal: Array = eqx.field(converter=as_leaf)
-    lateral: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
-    stiffness: Array | None = eqx.field(converter=lambda v: None if v is None else as_leaf(v), default=None)
+    normal: Array = eqx.field(converter=Leaf("Traction.normal", "MPa"))
+    lateral: Array | None = eqx.field(converter=Leaf("Traction.lateral", "MPa", optional=True), default=None)
+    stiffness: Array | None = eqx.field(converter=Leaf("Traction.stiffness", "MPa/mm", optional=True), default=None)
 
     def __check_init__(self):
         check_finite("Traction.normal", "MPa", self.normal)
@@ -81,6 +85,9 @@ class Traction(eqx.Module):
         if self.stiffness is not None:
             check_non_negative("Traction.stiffness", "MPa/mm", self.stiffness)
 
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
+
 
 class Displacement(eqx.Module):
     """Impose u_z on the interface nodes.
@@ -94,7 +101,7 @@ class Displacement(eqx.Module):
         ValueError: If a value is not finite, a shape is wrong, or `lateral` is unknown.
     """
 
-    uz: Array = eqx.field(converter=as_leaf)
+    uz: Array = eqx.field(converter=Leaf("Displacement.uz", "mm"))
     lateral: Literal["free", "fixed"] = eqx.field(static=True, default="free")
 
     def __check_init__(self):
@@ -103,6 +110,9 @@ class Displacement(eqx.Module):
             raise ValueError(f"Displacement.uz [mm] must be a number or (ny+1, nx+1), got shape {self.uz.shape}.")
         if self.lateral not in ("free", "fixed"):
             raise ValueError(f'Displacement.lateral must be "free" or "fixed", got {self.lateral!r}.')
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
 
 Load = Imprint | Traction | Displacement

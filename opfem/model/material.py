@@ -4,11 +4,15 @@ Stress and tangent are closed forms; `energy` is the oracle that tests different
 in the modified invariants; those in principal stretches are in `stretch_material`.
 """
 
+from typing import TYPE_CHECKING, Any
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_modulus, check_positive
+from .._checks import Leaf, check_finite, check_modulus, check_positive
+from .._repr import with_units
 from .deformation import (
     Kinematics,
     ProductSum,
@@ -19,17 +23,29 @@ from .deformation import (
     product,
     transpose,
 )
+from .plausible import check_modulus_unit
+
+Numbers = Array | np.ndarray
+"""On the device, or on the host (`stability`)."""
+LogStrain = Float[Numbers, "3 *points"]
 
 
 class AbstractMaterial(eqx.Module):
-    """An isotropic law; `bulk` is its bulk modulus [MPa]."""
+    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa], each a field or a property."""
 
     bulk: eqx.AbstractVar[Array]
+    if TYPE_CHECKING:  # as an abstract field it would count as an argument of laws whose shear modulus is a property
 
-    @property
-    def shear(self) -> Array:
-        """Initial shear modulus [MPa]."""
-        raise NotImplementedError
+        @property
+        def shear(self) -> Array:
+            """Initial shear modulus [MPa]."""
+            ...
+
+    def __check_init__(self):
+        check_modulus_unit(f"{type(self).__name__} shear modulus", self.shear)
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""
@@ -41,6 +57,10 @@ class AbstractMaterial(eqx.Module):
 
     def isochoric_tangent(self, k: Kinematics) -> ProductSum:
         """Compute the derivative of `isochoric_piola` by F [MPa]: A[i, J, k, L] = dP[i, J]/dF[k, L]."""
+        raise NotImplementedError
+
+    def log_stiffness(self, strain: LogStrain) -> Float[Numbers, "3 3 *points"]:
+        """Compute d²ψ/dε_a dε_b [MPa] by principal log strains, at constant volume; in NumPy where all is NumPy."""
         raise NotImplementedError
 
     def energy(self, H: Tensor) -> Float[Array, "*points"]:
@@ -83,11 +103,11 @@ class AbstractInvariantMaterial(AbstractMaterial):
         Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, ch. 6.
     """
 
-    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return dψ/dĪ1 and dψ/dĪ2 [MPa] at Ī1 - 3."""
         raise NotImplementedError
 
-    def curvature(self, I1_change: Array) -> Array | None:
+    def curvature(self, I1_change: Numbers) -> Any:
         """Return d²ψ/dĪ1² [MPa] at Ī1 - 3; None where it is zero for any stretch."""
         return None
 
@@ -96,6 +116,16 @@ class AbstractInvariantMaterial(AbstractMaterial):
         """Initial shear modulus [MPa]."""
         a, b = self.slopes(jnp.zeros_like(self.bulk))
         return 2.0 * (a + b)
+
+    def log_stiffness(self, strain: LogStrain) -> Float[Numbers, "3 3 *points"]:
+        """Compute d²ψ/dε_a dε_b [MPa] by principal log strains, at constant volume."""
+        xp = np if isinstance(strain, np.ndarray) else jnp
+        squares = xp.exp(2.0 * strain)
+        I1_change = squares.sum(axis=0) - 3.0
+        by_I1, by_I2 = (xp.asarray(slope) for slope in self.slopes(I1_change))
+        stiffness = on_diagonal(4.0 * (by_I1 * squares + by_I2 / squares))
+        curvature = self.curvature(I1_change)
+        return stiffness if curvature is None else stiffness + 4.0 * curvature * squares[:, None] * squares
 
     def isochoric_piola(self, k: Kinematics) -> Tensor:
         """Compute the isochoric part of the first Piola–Kirchhoff stress [MPa]."""
@@ -131,6 +161,11 @@ class AbstractInvariantMaterial(AbstractMaterial):
         return a, b, D, 2.0 / 3.0 * (a * k.I1 + 2.0 * b * k.I2)
 
 
+def on_diagonal(values: LogStrain) -> Float[Numbers, "3 3 *points"]:
+    """Put values on the diagonal of matrices."""
+    return values[:, None] * np.eye(3).reshape(3, 3, *[1] * (values.ndim - 1))
+
+
 class MooneyRivlin(AbstractInvariantMaterial):
     """Mooney–Rivlin: ψ = c10 (Ī1 - 3) + c01 (Ī2 - 3) + (bulk/2)(J - 1)².
 
@@ -138,8 +173,9 @@ class MooneyRivlin(AbstractInvariantMaterial):
     and D1 = 2/bulk. Initial shear modulus 2 (c10 + c01).
 
     Args:
-        c10: Coefficient of Ī1 [MPa], positive.
-        c01: Coefficient of Ī2 [MPa], zero or positive.
+        c10: Coefficient of Ī1 [MPa].
+        c01: Coefficient of Ī2 [MPa]; c10 + c01 is positive. One of them may be negative, as fits to silicones have it:
+            the law is then stable up to some stretch, and a solve that goes beyond says so (`RESULTS`).
         bulk: Bulk modulus [MPa], positive. opfem never guesses it: a published deck with D=0
             means bulk = 20 shear in Abaqus/Explicit and incompressible in a hybrid element.
 
@@ -147,9 +183,9 @@ class MooneyRivlin(AbstractInvariantMaterial):
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    c01: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("MooneyRivlin.c10", "MPa"))
+    c01: Array = eqx.field(converter=Leaf("MooneyRivlin.c01", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("MooneyRivlin.bulk", "MPa"))
 
     def __check_init__(self):
         check_finite("MooneyRivlin.c10", "MPa", self.c10)
@@ -157,7 +193,7 @@ class MooneyRivlin(AbstractInvariantMaterial):
         check_positive("MooneyRivlin shear modulus 2 (c10 + c01)", "MPa", 2.0 * (self.c10 + self.c01))
         check_modulus("MooneyRivlin.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return c10 and c01 [MPa]."""
         return self.c10, self.c01
 
@@ -168,9 +204,9 @@ class MooneyRivlin(AbstractInvariantMaterial):
 
 
 class NeoHooke(AbstractInvariantMaterial):
-    """Neo-Hooke: ψ = (shear/2)(Ī1 - 3) + (bulk/2)(J - 1)², with Ī1 = J^(-2/3) I1.
+    """Neo-Hooke: ψ = c10 (Ī1 - 3) + (bulk/2)(J - 1)², with Ī1 = J^(-2/3) I1.
 
-    Abaqus: *HYPERELASTIC, NEO HOOKE with C10 = shear/2 and D1 = 2/bulk.
+    Abaqus: *HYPERELASTIC, NEO HOOKE with C10 = c10 and D1 = 2/bulk. Initial shear modulus 2 c10.
 
     Args:
         c10: Half the initial shear modulus [MPa], positive.
@@ -180,14 +216,14 @@ class NeoHooke(AbstractInvariantMaterial):
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("NeoHooke.c10", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("NeoHooke.bulk", "MPa"))
 
     def __check_init__(self):
         check_positive("NeoHooke.c10", "MPa", self.c10)
         check_modulus("NeoHooke.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return c10 and zero [MPa]."""
         return self.c10, jnp.zeros_like(self.c10)
 
@@ -203,18 +239,18 @@ class Yeoh(AbstractInvariantMaterial):
 
     Args:
         c10: Coefficient of Ī1 - 3 [MPa], positive.
-        c20: Coefficient of its square [MPa], often negative.
-        c30: Coefficient of its cube [MPa].
+        c20: Coefficient of its square [MPa], often negative: see `MooneyRivlin` on what that does.
+        c30: Coefficient of its cube [MPa], of any sign.
         bulk: Bulk modulus [MPa], positive.
 
     Raises:
         ValueError: If a number is out of its range.
     """
 
-    c10: Array = eqx.field(converter=as_leaf)
-    c20: Array = eqx.field(converter=as_leaf)
-    c30: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    c10: Array = eqx.field(converter=Leaf("Yeoh.c10", "MPa"))
+    c20: Array = eqx.field(converter=Leaf("Yeoh.c20", "MPa"))
+    c30: Array = eqx.field(converter=Leaf("Yeoh.c30", "MPa"))
+    bulk: Array = eqx.field(converter=Leaf("Yeoh.bulk", "MPa"))
 
     def __check_init__(self):
         check_positive("Yeoh.c10", "MPa", self.c10)
@@ -222,11 +258,11 @@ class Yeoh(AbstractInvariantMaterial):
         check_finite("Yeoh.c30", "MPa", self.c30)
         check_modulus("Yeoh.bulk", "MPa", self.bulk)
 
-    def slopes(self, I1_change: Array) -> tuple[Array, Array]:
+    def slopes(self, I1_change: Numbers) -> tuple[Any, Any]:
         """Return dψ/dĪ1 and zero [MPa] at Ī1 - 3."""
         return self.c10 + (2.0 * self.c20 + 3.0 * self.c30 * I1_change) * I1_change, jnp.zeros_like(self.c10)
 
-    def curvature(self, I1_change: Array) -> Array:
+    def curvature(self, I1_change: Numbers) -> Any:
         """Return d²ψ/dĪ1² [MPa] at Ī1 - 3."""
         return 2.0 * self.c20 + 6.0 * self.c30 * I1_change
 

@@ -5,14 +5,16 @@ Every law is finite, with a finite slope, for any clearance.
 """
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import as_leaf, check_finite, check_positive, concrete
+from .._checks import Leaf, as_leaf, check_finite, check_positive, concrete
+from .._repr import with_units
+from .plausible import check_clearance_unit, check_modulus_unit
 
 # Overclosure, in units of c0, beyond which the exponential law continues along its tangent;
 # the same threshold as Abaqus (Theory Guide 5.2.1). At p0 = 2 MPa it is 1.3 GPa.
@@ -30,13 +32,20 @@ class AbstractOverclosure(eqx.Module):
 
     exact: ClassVar[bool] = False
 
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
+
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
         raise NotImplementedError
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
-        """Compute the clearance [mm] of a pressure: the inverse of `pressure`."""
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] of a pressure: the inverse of `pressure_at`."""
         raise NotImplementedError
+
+    def carried(self, pressure: Array, scale: Array) -> Array:
+        """Compute the clearance [mm] to shift the law by, so that it gives a pressure without any; 0 unless exact."""
+        return self.clearance_at(pressure, scale) if self.exact else jnp.zeros_like(pressure)
 
     @property
     def zero_pressure_clearance(self) -> Array:
@@ -79,15 +88,17 @@ class HardOverclosure(AbstractOverclosure):
     def __init__(self, stiffness_ratio=None, exact: bool = False):
         if stiffness_ratio is None:
             stiffness_ratio = 100.0 if exact else 1000.0
-        check_positive("HardOverclosure.stiffness_ratio", "-", stiffness_ratio)
-        self.stiffness_ratio = as_leaf(stiffness_ratio)
+        self.stiffness_ratio = as_leaf(stiffness_ratio, "HardOverclosure.stiffness_ratio")
         self.exact = exact
 
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def __check_init__(self):
+        check_positive("HardOverclosure.stiffness_ratio", "-", self.stiffness_ratio)
+
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
         return self.stiffness_ratio * scale * _overclosure(clearance)
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure."""
         return -pressure / (self.stiffness_ratio * scale)
 
@@ -107,16 +118,16 @@ class LinearOverclosure(AbstractOverclosure):
         ValueError: If the stiffness is not positive.
     """
 
-    stiffness: Array = eqx.field(converter=as_leaf)
+    stiffness: Array = eqx.field(converter=Leaf("LinearOverclosure.stiffness", "MPa/mm"))
 
     def __check_init__(self):
         check_positive("LinearOverclosure.stiffness", "MPa/mm", self.stiffness)
 
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
         return self.stiffness * _overclosure(clearance)
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure."""
         return -pressure / self.stiffness
 
@@ -142,27 +153,27 @@ class ExponentialOverclosure(AbstractOverclosure):
         Abaqus Theory Guide 5.2.1; values in VALIDATION.md, table E.
     """
 
-    p0: Array
-    c0: Array
+    pressure: Array = eqx.field(converter=Leaf("ExponentialOverclosure.pressure (p0)", "MPa"))
+    clearance: Array = eqx.field(converter=Leaf("ExponentialOverclosure.clearance (c0)", "mm"))
 
-    def __init__(self, pressure, clearance):
-        check_positive("ExponentialOverclosure.pressure (p0)", "MPa", pressure)
-        check_positive("ExponentialOverclosure.clearance (c0)", "mm", clearance)
-        self.p0 = as_leaf(pressure)
-        self.c0 = as_leaf(clearance)
+    def __check_init__(self):
+        check_positive("ExponentialOverclosure.pressure (p0)", "MPa", self.pressure)
+        check_positive("ExponentialOverclosure.clearance (c0)", "mm", self.clearance)
+        check_modulus_unit("ExponentialOverclosure.pressure (p0)", self.pressure)
+        check_clearance_unit("ExponentialOverclosure.clearance (c0)", self.clearance)
 
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
-        s = 1.0 - clearance / self.c0
+        s = 1.0 - clearance / self.clearance
         top = 1.0 + _LINEAR_BEYOND
         inside = jnp.clip(s, 0.0, top)
         exponential = jnp.exp(inside)
         slope = (1.0 + top) * math.exp(top) - 1.0
-        return self.p0 / (np.e - 1.0) * (inside * (exponential - 1.0) + slope * jnp.maximum(s - top, 0.0))
+        return self.pressure / (np.e - 1.0) * (inside * (exponential - 1.0) + slope * jnp.maximum(s - top, 0.0))
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure, by Newton's method on s (eˢ - 1)."""
-        ratio = pressure * (np.e - 1.0) / self.p0
+        ratio = pressure * (np.e - 1.0) / self.pressure
         top = 1.0 + _LINEAR_BEYOND
         at_top, slope = top * (math.exp(top) - 1.0), (1.0 + top) * math.exp(top) - 1.0
         inside = jnp.minimum(ratio, at_top)
@@ -171,12 +182,12 @@ class ExponentialOverclosure(AbstractOverclosure):
             rise = jnp.expm1(s)
             slope_here = rise + s * (1.0 + rise)
             s = s - jnp.where(s > 0, (s * rise - inside) / jnp.where(s > 0, slope_here, 1.0), 0.0)
-        return self.c0 * (1.0 - s - jnp.maximum(ratio - at_top, 0.0) / slope)
+        return self.clearance * (1.0 - s - jnp.maximum(ratio - at_top, 0.0) / slope)
 
     @property
     def zero_pressure_clearance(self) -> Array:
         """Clearance at which pressure starts [mm]."""
-        return self.c0
+        return self.clearance
 
 
 class TabularOverclosure(AbstractOverclosure):
@@ -192,20 +203,18 @@ class TabularOverclosure(AbstractOverclosure):
         ValueError: If the table has fewer than two rows, or does not rise and fall.
     """
 
-    pressures: Array
-    clearances: Array
+    pressure: Array = eqx.field(converter=Leaf("TabularOverclosure.pressure", "MPa"))
+    clearance: Array = eqx.field(converter=Leaf("TabularOverclosure.clearance", "mm"))
 
-    def __init__(self, pressure, clearance):
-        self.pressures = as_leaf(pressure)
-        self.clearances = as_leaf(clearance)
-        if self.pressures.ndim != 1 or self.pressures.shape != self.clearances.shape or self.pressures.size < 2:
+    def __check_init__(self):
+        if self.pressure.ndim != 1 or self.pressure.shape != self.clearance.shape or self.pressure.size < 2:
             raise ValueError(
                 "TabularOverclosure.pressure [MPa] and .clearance [mm] must be two lists of one length, at least 2, "
-                f"got shapes {self.pressures.shape} and {self.clearances.shape}."
+                f"got shapes {self.pressure.shape} and {self.clearance.shape}."
             )
-        check_finite("TabularOverclosure.pressure", "MPa", self.pressures)
-        check_finite("TabularOverclosure.clearance", "mm", self.clearances)
-        pressures, clearances = concrete(self.pressures), concrete(self.clearances)
+        check_finite("TabularOverclosure.pressure", "MPa", self.pressure)
+        check_finite("TabularOverclosure.clearance", "mm", self.clearance)
+        pressures, clearances = concrete(self.pressure), concrete(self.clearance)
         if pressures is not None and (pressures[0] != 0.0 or (np.diff(pressures) <= 0).any()):
             raise ValueError(f"TabularOverclosure.pressure [MPa] must rise from 0, got {pressures.tolist()}.")
         if clearances is not None and (np.diff(clearances) >= 0).any():
@@ -213,19 +222,21 @@ class TabularOverclosure(AbstractOverclosure):
                 f"TabularOverclosure.clearance [mm] must fall from row to row, got {clearances.tolist()}. "
                 "Overclosure is minus the clearance."
             )
+        check_modulus_unit("TabularOverclosure.pressure", self.pressure)
+        check_clearance_unit("TabularOverclosure.clearance", self.clearance)
 
-    def pressure(self, clearance: Array, scale: Array) -> Array:
+    def pressure_at(self, clearance: Array, scale: Array) -> Array:
         """Compute the contact pressure [MPa]."""
-        return _along(-clearance, -self.clearances, self.pressures)
+        return _along(-clearance, -self.clearance, self.pressure)
 
-    def clearance(self, pressure: Array, scale: Array) -> Array:
+    def clearance_at(self, pressure: Array, scale: Array) -> Array:
         """Compute the clearance [mm] of a pressure."""
-        return self.clearances[0] - _along(pressure, self.pressures, self.clearances[0] - self.clearances)
+        return self.clearance[0] - _along(pressure, self.pressure, self.clearance[0] - self.clearance)
 
     @property
     def zero_pressure_clearance(self) -> Array:
         """Clearance at which pressure starts [mm]."""
-        return self.clearances[0]
+        return self.clearance[0]
 
 
 def _along(x: Array, rows: Array, values: Array) -> Array:

@@ -1,7 +1,7 @@
 """The experiment: a layer between window and sample, its field, its mesh and its sides."""
 
 from collections.abc import Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_leaf, check_positive, concrete
+from .._repr import with_units
 from .contact import Bonded, Contact, Roller, Side
 from .layer import Layer
 from .mesh import LayerMesh
@@ -45,13 +46,13 @@ class Palpation(eqx.Module):
     """
 
     layer: Layer
-    extent: Float[Array, "2"]
+    extent: Float[Array, "2"] = eqx.field(metadata={"unit": "mm"})
     elements: tuple[int, int, int] = eqx.field(static=True)
     window: Side
     sample: Side
     sides: tuple[str, str, str, str] = eqx.field(static=True)
     element: Element = eqx.field(static=True)
-    hold: Array | None
+    hold: Array | None = eqx.field(metadata={"unit": "N/mm"})
 
     def __init__(
         self,
@@ -68,7 +69,8 @@ class Palpation(eqx.Module):
             raise ValueError(f"Palpation.layer must be a Layer, got {type(layer).__name__}.")
         if np.shape(extent) != (2,):
             raise ValueError(f"Palpation.extent [mm] must be (Lx, Ly), got {extent!r}.")
-        check_positive("Palpation.extent", "mm", jnp.asarray(extent))
+        extent = as_leaf(extent, "Palpation.extent", "mm")
+        check_positive("Palpation.extent", "mm", extent)
         counts = tuple(int(n) for n in elements)
         if len(counts) != 3 or min(counts) < 1 or counts != tuple(elements):
             raise ValueError(f"Palpation.elements must be three whole numbers (nx, ny, nz) ≥ 1, got {elements!r}.")
@@ -87,16 +89,20 @@ class Palpation(eqx.Module):
                 f"Palpation.element={element!r} needs a finite bulk modulus [MPa], got {bulk}. For an incompressible "
                 'layer pass element="hybrid".'
             )
+        hold = None if hold is None else as_leaf(hold, "Palpation.hold", "N/mm")
         if hold is not None:
             check_positive("Palpation.hold", "N/mm", hold)
         self.layer = layer
-        self.extent = as_leaf(jnp.asarray(extent))
+        self.extent = extent
         self.elements = counts
         self.window = window
         self.sample = sample
         self.sides = _sides(sides)
         self.element = element
-        self.hold = None if hold is None else as_leaf(hold)
+        self.hold = hold
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
 
     def mesh(self) -> LayerMesh:
         """Build the mesh, with the layer's thickness sampled at its nodes."""

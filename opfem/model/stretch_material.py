@@ -14,11 +14,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_leaf, check_finite, check_modulus, check_positive, concrete
+from .._checks import Leaf, check_finite, check_modulus, check_positive, concrete
 from .deformation import Kinematics, ProductSum, Tensor, identity_like, product, transpose
-from .material import AbstractMaterial
+from .material import AbstractMaterial, LogStrain, Numbers, on_diagonal
 
 _SWEEPS = 6  # of Jacobi's method on 3×3: it converges quadratically, and five reach rounding
 
@@ -43,6 +44,11 @@ class AbstractStretchMaterial(AbstractMaterial):
     def divided_difference(self, start: Array, step: Array) -> Array:
         """Compute (w'(start + step) - w'(start)) / step [MPa] without cancellation; w'' at step 0."""
         raise NotImplementedError
+
+    def log_stiffness(self, strain: LogStrain) -> Float[Numbers, "3 3 *points"]:
+        """Compute d²ψ/dε_a dε_b [MPa] by principal log strains, at constant volume."""
+        xp = np if isinstance(strain, np.ndarray) else jnp
+        return on_diagonal(xp.asarray(self.curvature(jnp.asarray(strain))))
 
     def isochoric_energy(self, k: Kinematics) -> Float[Array, "*points"]:
         """Compute the isochoric part of the energy density [MPa]."""
@@ -80,7 +86,8 @@ class Ogden(AbstractStretchMaterial):
     Σ mu_p. Where a source writes ψ = Σ_p m_p/alpha_p (Σ_a λ_a^alpha_p - 3), mu_p = m_p alpha_p / 2.
 
     Args:
-        mu: Moduli of the terms [MPa], `(terms,)`; their sum is positive.
+        mu: Moduli of the terms [MPa], `(terms,)`; their sum is positive. Where one is negative the law may be stable up
+            to some stretch only: see `MooneyRivlin`.
         alpha: Exponents of the terms [-], `(terms,)`, none zero.
         bulk: Bulk modulus [MPa], positive.
 
@@ -88,9 +95,9 @@ class Ogden(AbstractStretchMaterial):
         ValueError: If a number is out of its range, or mu and alpha are not two lists of one length.
     """
 
-    mu: Array = eqx.field(converter=as_leaf)
-    alpha: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    mu: Array = eqx.field(converter=Leaf("Ogden.mu", "MPa"))
+    alpha: Array = eqx.field(converter=Leaf("Ogden.alpha", "-"))
+    bulk: Array = eqx.field(converter=Leaf("Ogden.bulk", "MPa"))
 
     def __check_init__(self):
         if self.mu.ndim != 1 or self.mu.shape != self.alpha.shape or self.mu.size == 0:
@@ -133,47 +140,42 @@ class Ogden(AbstractStretchMaterial):
 
 
 class Hencky(AbstractStretchMaterial):
-    """Hencky: ψ = mu |dev ln U|² + (bulk/2)(J - 1)², linear elasticity in logarithmic strain.
+    """Hencky: ψ = shear |dev ln U|² + (bulk/2)(J - 1)², linear elasticity in logarithmic strain.
 
-    The law to compare with small-strain results: its deviatoric Kirchhoff stress is 2 mu times the
+    The law to compare with small-strain results: its deviatoric Kirchhoff stress is 2 shear times the
     deviatoric logarithmic strain, its mean Cauchy stress bulk (J - 1). Abaqus has no equal; its *ELASTIC with
     NLGEOM is close (a rate form in the same strain, with bulk ln J for bulk (J - 1)).
 
     Args:
-        mu: Shear modulus [MPa], positive.
+        shear: Shear modulus [MPa], positive.
         bulk: Bulk modulus [MPa], positive.
 
     Raises:
         ValueError: If a number is out of its range.
     """
 
-    mu: Array = eqx.field(converter=as_leaf)
-    bulk: Array = eqx.field(converter=as_leaf)
+    shear: Array = eqx.field(converter=Leaf("Hencky.shear", "MPa"))  # pyright: ignore[reportIncompatibleVariableOverride]
+    bulk: Array = eqx.field(converter=Leaf("Hencky.bulk", "MPa"))
 
     def __check_init__(self):
-        check_positive("Hencky.mu", "MPa", self.mu)
+        check_positive("Hencky.shear", "MPa", self.shear)
         check_modulus("Hencky.bulk", "MPa", self.bulk)
-
-    @property
-    def shear(self) -> Array:
-        """Shear modulus [MPa]."""
-        return self.mu
 
     def density(self, strain: Stretches) -> Stretches:
         """Compute what each stretch stores [MPa]."""
-        return self.mu * strain**2
+        return self.shear * strain**2
 
     def slope(self, strain: Stretches) -> Stretches:
         """Compute w' [MPa]."""
-        return 2.0 * self.mu * strain
+        return 2.0 * self.shear * strain
 
     def curvature(self, strain: Stretches) -> Stretches:
         """Compute w'' [MPa]."""
-        return jnp.broadcast_to(2.0 * self.mu, strain.shape)
+        return jnp.broadcast_to(2.0 * self.shear, strain.shape)
 
     def divided_difference(self, start: Array, step: Array) -> Array:
         """Compute (w'(start + step) - w'(start)) / step [MPa]."""
-        return jnp.broadcast_to(2.0 * self.mu, step.shape)
+        return jnp.broadcast_to(2.0 * self.shear, step.shape)
 
 
 class _Principal(NamedTuple):

@@ -15,6 +15,7 @@ from .._checks import concrete
 from ..inverse import FitStatus, TractionFit
 from ..model import Imprint
 from ..solvers import CONVERGED, RESULTS, FaceResult, Solution
+from ..solvers.solution import OPEN, is_failure
 from .fields import under_pixels
 from .interior import layer_fields
 from .provenance import describe, inputs_hash, steps_as_json, versions
@@ -44,6 +45,9 @@ STATS = {
     "approach": ("mm", "approach of sample and layer that the contact law itself causes"),
     "max_penetration": ("mm", "largest penetration"),
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
+    "min_stretch": ("1", "smallest principal stretch in the layer, volume change taken out"),
+    "max_stretch": ("1", "largest principal stretch in the layer, volume change taken out"),
+    "unstable_stretch": ("1", "stretch reached from which on the material law is unstable, 0: none"),
     "increment": ("s", "shortest time increment"),
     "kinetic_ratio": ("1", "largest kinetic over all energy after the first tenth of the load"),
     "energy_drift": ("1", "largest energy missing from the balance over all energy"),
@@ -123,7 +127,22 @@ def status_name(solution: Solution) -> str:
 
 def status_message(solution: Solution) -> str:
     """Say in words how a solve ended; empty when all is well."""
-    return RESULTS[solution.result]
+    message = RESULTS[solution.result]
+    if status_name(solution) == "material_unstable":
+        low, high, limit = (float(solution.stats[f"{name}_stretch"]) for name in ("min", "max", "unstable"))
+        message += f" Stretches reach from {low:.3g} to {high:.3g}; from {limit:.3g} on it is unstable."
+    elif touches_nowhere(solution):
+        message = (
+            "Nothing touches: the layer is unloaded, and every pressure is zero. Is the map thicker than L0, or in "
+            "another unit?"
+        )
+    return message
+
+
+def touches_nowhere(solution: Solution) -> bool:
+    """Tell whether an imprint has reached its full depth without contact anywhere."""
+    imprinted = isinstance(solution.load, Imprint) and not bool(is_failure(solution.result))
+    return imprinted and not np.any(np.asarray(solution.contact_status) != OPEN)
 
 
 def _require_one(solution: Solution) -> None:
@@ -233,7 +252,7 @@ def _pressure_image(
     lateral = np.asarray(solution.displacement[:2, -1])
     if not np.isfinite(lateral).all():
         return np.full(x.shape, np.nan)
-    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)[0]
+    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)
 
 
 def _fit(fit: TractionFit) -> dict[str, Variable]:

@@ -28,13 +28,14 @@ def summary(solution: Solution) -> dict[str, Any]:
     """
     stats = {name: np.asarray(value) for name, value in solution.stats.items()}
     forces = {f"{name}_N": stats[name].tolist() for name in ("force_sample", "force_window", "force_hold")}
+    pressing = np.linalg.norm(stats["force_sample"])
     unbalanced = np.linalg.norm(sum(stats[name] for name in ("force_sample", "force_window", "force_hold")))
     numbers = {
         "status": status_name(solution),
         "status_message": status_message(solution),
         "load_reached_percent": 100.0 * float(solution.last_converged.load_fraction),
         **forces,
-        "force_imbalance_percent": 100.0 * float(unbalanced / np.linalg.norm(stats["force_sample"])),
+        "force_imbalance_percent": 100.0 * float(unbalanced / pressing) if pressing else math.nan,
         **_pressures(solution),
         **_contact(solution),
         "max_lateral_displacement_um": _UM * float(np.hypot(*np.asarray(solution.displacement[:2, -1])).max()),
@@ -59,7 +60,7 @@ def summary_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
     fx, fy, fz = numbers["force_sample_N"]
     shares = [f"{100 * numbers[f'{state}_fraction']:.0f}" for state in ("open", "stick", "slip")]
     return [
-        ("force on the layer, normal", f"{-fz:.4g}", "N"),
+        ("force on the layer, normal", f"{0.0 - fz:.4g}", "N"),
         ("force on the layer, lateral", f"{math.hypot(fx, fy):.2g}", "N"),
         ("mean pressure", f"{numbers['pressure_mean_kPa']:.3g}", "kPa"),
         ("99th percentile of pressure", f"{numbers['pressure_p99_kPa']:.3g}", "kPa"),
@@ -115,4 +116,6 @@ def _share(where: Bool[np.ndarray, "ny nx"], area: Float[np.ndarray, "ny nx"]) -
 def _known(value: Any) -> Any:
     if isinstance(value, list):
         return [_known(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    return value + 0.0 if math.isfinite(value) else None  # -0.0 becomes 0.0

@@ -26,6 +26,7 @@ from ..model import (
     Traction,
     height_field,
 )
+from ..model.plausible import check_against_layer
 from .equilibrium import Problem
 from .supports import Supports, drift_modes
 from .tangent import VOLUME_GUARD
@@ -124,7 +125,7 @@ def _contact(side: Side) -> Contact:
 
 
 def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
-    """Raise ValueError where load and sample contradict each other."""
+    """Raise ValueError where load and sample contradict each other, or map and layer; warn where these are in doubt."""
     if not isinstance(load, (Imprint, Traction, Displacement)):
         raise ValueError(f"load must be Imprint, Traction or Displacement, got {type(load).__name__}.")
     if start is not None and type(start) is not type(load):
@@ -150,6 +151,8 @@ def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> No
                 "Displacement(lateral='free') leaves the interface without friction, but sample.friction [-] is not "
                 "zero. Pass sample=Roller(), or press the shape in with Imprint."
             )
+    if isinstance(load, Imprint):
+        check_against_layer("Imprint.thickness", load.thickness, palpation.layer.thickness, palpation.extent, 4)
 
 
 def _supports(palpation: Palpation, load: Load) -> Supports:

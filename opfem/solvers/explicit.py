@@ -35,6 +35,11 @@ _OUTPUTS = 20
 _COMPILES = "the explicit solver, about 10 s the first time"
 
 
+def _plain(value: Any) -> Any:
+    """Turn a number of NumPy or JAX, which a static field may not hold, into Python's."""
+    return float(value) if isinstance(value, np.generic | jax.Array) and not isinstance(value, Tracer) else value
+
+
 @runtime_checkable
 class Checkpoint(Protocol):
     """Where a run keeps its state, so that a killed one can go on; `opfem.Checkpoint` is one in a file."""
@@ -84,12 +89,12 @@ class Explicit(eqx.Module):
     density: Any = 1e-9
     bulk_viscosity: tuple[Any, Any] = (0.06, 1.2)
     damping: Any = 0.0
-    duration: float = eqx.field(static=True, default=1.0)
+    duration: float = eqx.field(static=True, converter=_plain, default=1.0)
     amplitude: Amplitude = eqx.field(static=True, default="smooth_step")
-    increment: float | Literal["auto"] = eqx.field(static=True, default="auto")
-    output_every: float | None = eqx.field(static=True, default=None)
-    safety: float = eqx.field(static=True, default=0.9)
-    energy_limit: float = eqx.field(static=True, default=0.05)
+    increment: float | Literal["auto"] = eqx.field(static=True, converter=_plain, default="auto")
+    output_every: float | None = eqx.field(static=True, converter=_plain, default=None)
+    safety: float = eqx.field(static=True, converter=_plain, default=0.9)
+    energy_limit: float = eqx.field(static=True, converter=_plain, default=0.05)
     precision: Literal["float32"] | None = eqx.field(static=True, default=None)
     checkpoint: Any = eqx.field(static=True, default=None)
 
@@ -346,6 +351,7 @@ def _finish(
         "increment": jnp.nanmin(history.increment),
         "kinetic_ratio": history.kinetic_ratio,
         "energy_drift": history.drift,
+        **fields.stretches,
         "output_time": history.time,
         "output_increment": history.increment,
         **{f"energy_{name}": values for name, values in history.energies.items()},

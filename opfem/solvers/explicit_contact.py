@@ -168,7 +168,8 @@ def _push(face: ContactFace, guess: Face, free: Face, mobility: Face, area: Face
     give = mobility * area
 
     def newton(clearance):
-        pressure, slope = jax.jvp(lambda c: law.pressure(c, face.stiffness), (clearance,), (jnp.ones_like(clearance),))
+        one = jnp.ones_like(clearance)
+        pressure, slope = jax.jvp(lambda c: law.pressure_at(c, face.stiffness), (clearance,), (one,))
         slope = jax.lax.stop_gradient(slope)
         after = clearance - (clearance - free - give * pressure) / (1.0 - jax.lax.stop_gradient(give) * slope)
         return after, pressure + slope * (after - clearance)

@@ -8,7 +8,7 @@ from ..model import Load
 from .equilibrium import Forces
 from .explicit_contact import FaceMotion
 from .explicit_step import Dynamics, Motion
-from .recover import Fields, deformed_thickness, per_area
+from .recover import Fields, deformed_thickness, per_area, reached_stretches
 from .solution import OPEN, SLIP, STICK, FaceResult
 
 
@@ -48,8 +48,9 @@ def recover_motion(dynamics: Dynamics, m: Motion, load: Load) -> Fields:
     return Fields(
         _face(dynamics, "sample", m.sample, u, sample),
         _face(dynamics, "window", m.window, u, window),
-        deformed_thickness(problem, u, load),
+        deformed_thickness(problem.positions[:, -1], u[:, -1], load),
         top,
+        reached_stretches(problem, u),
         stats,
     )
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._checks import check_positive
@@ -73,7 +74,7 @@ class Newton(eqx.Module):
 
     def as_leaves(self) -> "Newton":
         """Make every number an array, so that another value compiles nothing anew."""
-        return jax.tree.map(jnp.asarray, self)
+        return jax.tree.map(lambda v: jnp.asarray(float(v) if isinstance(v, np.floating) else v), self)
 
     def __check_init__(self):
         for name in (

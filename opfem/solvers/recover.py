@@ -15,13 +15,10 @@ from ..mechanics.face import (
     to_corners,
     tributary_area,
 )
-from ..model import Imprint, Load
+from ..mechanics.interface_point import NodalField, locate
+from ..model import Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State
 from .solution import OPEN, SLIP, STICK, FaceResult
-
-# Fixed-point steps to find which reference point lies below a spatial one. Each reduces the
-# error by the lateral displacement gradient, about 0.3 on a sharp map.
-_INVERSE_STEPS = 24
 
 
 class Fields(eqx.Module):
@@ -31,6 +28,7 @@ class Fields(eqx.Module):
     window: FaceResult
     thickness: ThicknessMap
     stress_zz: Float[Array, "ny nx"]
+    stretches: dict[str, Array]
     stats: dict[str, Array]
 
 
@@ -63,7 +61,20 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         "min_volume_ratio": forces.smallest_J,
     }
     top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
-    return Fields(sample, window, deformed_thickness(problem, u, load), top, stats)
+    return Fields(
+        sample,
+        window,
+        deformed_thickness(problem.positions[:, -1], u[:, -1], load),
+        top,
+        reached_stretches(problem, u),
+        stats,
+    )
+
+
+def reached_stretches(problem: Problem, u: Array) -> dict[str, Array]:
+    """Find the smallest and the largest principal stretch in the layer."""
+    smallest, largest = extreme_stretches(problem.body.kinematics(u))
+    return {"min_stretch": smallest, "max_stretch": largest}
 
 
 def _face(
@@ -126,37 +137,23 @@ def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Arra
     return pressure, force / filled_vertices(tributary_area(X, cells), cells)
 
 
-def deformed_thickness(problem: Problem, u: Array, load: Load) -> ThicknessMap:
-    """Read the deformed interface at the load's grid points, or at the mesh's own."""
-    X = problem.positions[:, -1]
+def deformed_thickness(X: Float[Array, "3 my mx"], u: Float[Array, "3 my mx"], load: Load) -> ThicknessMap:
+    """Read the deformed interface at the load's grid points, or at the mesh's own; masked where none lies above.
+
+    Args:
+        X: Reference positions of the interface's nodes [mm].
+        u: Their displacement [mm].
+        load: The load.
+    """
+    far = X[:2, -1, -1]
+    size = far / jnp.array([X.shape[2] - 1, X.shape[1] - 1])
     if isinstance(load, Imprint):
         grid = load.thickness
         extent, origin = grid.extent, grid.origin
         y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
     else:
-        extent, origin = jnp.stack([X[0, -1, -1], X[1, -1, -1]]), jnp.zeros(2, u.dtype)
+        extent, origin = far, jnp.zeros(2, u.dtype)
         x, y = X[0], X[1]
-    reach = jnp.stack([X[0, -1, -1], X[1, -1, -1]])
-    spacing = reach / jnp.array([X.shape[2] - 1, X.shape[1] - 1])
-
-    def at(px, py):
-        return _bilinear(jnp.concatenate([u[:2, -1], (X + u[:, -1])[2:]]), px / spacing[0], py / spacing[1])
-
-    def closer(_, p):
-        moved = at(*p)
-        return jnp.stack([x - moved[0], y - moved[1]])
-
-    p = jax.lax.fori_loop(0, _INVERSE_STEPS, closer, jnp.stack([x, y]))
-    slack = 1e-6 * spacing[:, None, None]
-    outside = jnp.any((p < -slack) | (p > reach[:, None, None] + slack), axis=0)
-    return ThicknessMap(at(*p)[2], extent=extent, origin=origin, mask=outside, is_filled=True)
-
-
-def _bilinear(values: Float[Array, "c ny nx"], i: Array, j: Array) -> Array:
-    ny, nx = values.shape[1:]
-    i, j = jnp.clip(i, 0.0, nx - 1.0), jnp.clip(j, 0.0, ny - 1.0)
-    a, b = jnp.clip(jnp.floor(i), 0, nx - 2).astype(int), jnp.clip(jnp.floor(j), 0, ny - 2).astype(int)
-    s, t = i - a, j - b
-    low = (1 - s) * values[:, b, a] + s * values[:, b, a + 1]
-    high = (1 - s) * values[:, b + 1, a] + s * values[:, b + 1, a + 1]
-    return (1 - t) * low + t * high
+    below = locate(NodalField(u[:2], size), jnp.stack([x, y]), far, size)
+    height, _, _ = NodalField((X + u)[2:], size)(*below.at)
+    return ThicknessMap(height[0], extent=extent, origin=origin, mask=~jnp.all(below.found, axis=0), is_filled=True)

@@ -1,5 +1,6 @@
 """What a solve returns: fields, status and statistics."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -7,8 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._checks import concrete
 from ..measurement import ThicknessMap
-from ..model import Load, Palpation
+from ..model import Load, Palpation, unstable_stretch
 from .equilibrium import State
 from .explicit_step import Motion
 
@@ -42,16 +44,32 @@ class RESULTS(eqx.Enumeration):
     element_inverted = (
         "An element inverted. Smooth the map (smoothed(fwhm=...)), raise Explicit.duration, or lower Explicit.safety."
     )
+    material_unstable = (
+        "Solved, but elements are stretched beyond where the material law is stable (Drucker): it resists less, the "
+        "more it deforms, and the answer need not be the only one. Take a law that fits these stretches."
+    )
     nonfinite = "The inputs lead to NaN or infinite forces. Check the map, the thickness and the material."
 
 
-CONVERGED = ("successful", "slides_off", "kinetic_energy_high")
+CONVERGED = ("successful", "slides_off", "kinetic_energy_high", "material_unstable")
 """How a solve ends that has reached its load."""
 
 
 def is_failure(result: RESULTS) -> Bool[Array, ""]:
     """Tell whether a solve has not reached its load."""
     return ~functools.reduce(jnp.logical_or, [result == getattr(RESULTS, name) for name in CONVERGED])
+
+
+def judged(solution: "Solution") -> "Solution":
+    """Note in stats and status where a solve stretched elements beyond what its law is stable for."""
+    stats = solution.stats
+    unstable = unstable_stretch(solution.palpation.layer.material, stats["min_stretch"], stats["max_stretch"])
+    solution = dataclasses.replace(solution, stats={**stats, "unstable_stretch": unstable})
+    known = concrete(unstable)
+    if known is not None and not known:
+        return solution
+    beyond = (unstable > 0) & ~is_failure(solution.result)
+    return dataclasses.replace(solution, result=RESULTS.where(beyond, RESULTS.material_unstable, solution.result))
 
 
 class FaceResult(eqx.Module):

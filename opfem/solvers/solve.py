@@ -1,5 +1,7 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,7 @@ from .explicit import Explicit, solve_explicit
 from .newton import Newton
 from .progress import Progress
 from .recover import recover
-from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure
+from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure, judged
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
 # Compiling takes as long whatever the mesh.
@@ -47,7 +49,9 @@ def solve(
         `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
         the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N mm] about the origin,
         `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
-        `max_penetration` [mm], `min_volume_ratio` [-].
+        `max_penetration` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
+        stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
+        law is unstable, 0 if it was stable as far as it was stretched).
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.
@@ -55,15 +59,15 @@ def solve(
     """
     if isinstance(solver, Explicit):
         check_compatible(palpation, load, None if start is None else start.load)
-        solution = solve_explicit(palpation, load, solver, start, progress)
+        solution = judged(solve_explicit(palpation, load, solver, start, progress))
         return _raise_on_failure(solution, is_traced(solution)) if throw else solution
-    require_float64(palpation)
     solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
     first = None if start is None else start.last_converged.state
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
+    require_float64("Newton", palpation=palpation, load=load, start=first, solver=solver)
     traced = is_traced((palpation, load, load_start, first, solver))
     run = _run_differentiable if traced else _run_with_progress
     with Progress(progress and not traced) as bar:
@@ -74,7 +78,7 @@ def solve(
         if getattr(load, "correct_approach", False):
             problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, bar)
         bar.stage("fields")
-        solution = finish(problem, stepping, palpation, load)
+        solution = judged(finish(problem, stepping, palpation, load))
     return _raise_on_failure(solution, traced) if throw else solution
 
 
@@ -161,6 +165,7 @@ def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> S
         "attempts": s.attempts,
         "residual": s.residual,
         "load_fraction": s.state.fraction,
+        **fields.stretches,
     }
 
     def kept(field):
@@ -189,15 +194,23 @@ def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
         return solution.result.error_if(solution, failed)
     if bool(failed):
         reached = float(solution.last_converged.load_fraction)
-        raise ConvergenceError(f"The solve stopped at {reached:.1%} of the load. {RESULTS[solution.result]}", solution)
+        message = f"The solve stopped at {reached:.1%} of the load. {RESULTS[solution.result]}"
+        unstable = float(solution.stats["unstable_stretch"])
+        if unstable:
+            message += f" The material law loses stability at a stretch of {unstable:.3g}, which elements had reached."
+        raise ConvergenceError(message, solution)
     return solution
 
 
-def require_float64(palpation: Palpation) -> None:
-    """Raise ValueError where numbers are float32."""
-    dtypes = {leaf.dtype for leaf in jax.tree.leaves(palpation) if eqx.is_inexact_array(leaf)}
-    if jnp.dtype("float32") in dtypes:
-        raise ValueError(
-            "Newton needs float64 numbers, got float32. Before building the layer, run "
-            'jax.config.update("jax_enable_x64", True) once.'
-        )
+def require_float64(caller: str, **inputs: Any) -> None:
+    """Raise ValueError where numbers are not float64: the first such input, by its name, and what to do."""
+    for name, part in inputs.items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+            if not eqx.is_inexact_array(leaf) or leaf.dtype == jnp.dtype("float64"):
+                continue
+            if jnp.zeros((), float).dtype == jnp.dtype("float64"):
+                advice = "It was made while jax_enable_x64 was off, or cast since; build it again."
+            else:
+                advice = 'Before building the layer, run jax.config.update("jax_enable_x64", True) once.'
+            place = ".".join([name, jax.tree_util.keystr(path, simple=True, separator=".")]).removesuffix(".")
+            raise ValueError(f"{caller} needs float64 numbers, got {leaf.dtype} in {place}. {advice}")

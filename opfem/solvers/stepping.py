@@ -78,7 +78,7 @@ class Stepping(NamedTuple):
         missed_gap: Gap or penetration of hard contact at the last converged state that more increments can
             take away [mm].
         failed: Whether the solve has given up.
-        fractions: Load fraction of every accepted increment, NaN beyond.
+        exhausted: Whether the most increments allowed were tried.
         path: The solves that led to `origin`, for derivatives; None where none are asked for.
         length: How many solves of `path` led to `origin`.
         kept: How many of them led to `state`.
@@ -101,7 +101,7 @@ class Stepping(NamedTuple):
     slides: Array
     missed_gap: Float[Array, ""]
     failed: Array
-    fractions: Float[Array, " attempts"]
+    exhausted: Array
     path: Path | None
     length: Array
     kept: Array
@@ -131,7 +131,7 @@ def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
         slides=no,
         missed_gap=zero,
         failed=no,
-        fractions=jnp.full(settings.max_increments, jnp.nan, dtype),
+        exhausted=no,
         path=path if with_path else None,
         length=none,
         kept=none,
@@ -166,7 +166,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     )
     can_release, slides = _hold_balance(problem, result.forces, result.state)
     missed_gap = problem.missed_gap(s.origin, result.state)
-    none = s._replace(state=None, before=None, origin=None, fractions=None, path=None)
+    none = s._replace(state=None, before=None, origin=None, path=None)
     trial = _Trial(
         increment=increment,
         held=held,
@@ -190,7 +190,6 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         residual=jnp.where(accepted, result.residual, s.residual),
         can_release=jnp.where(accepted, can_release, s.can_release),
         slides=jnp.where(accepted, slides, s.slides),
-        fractions=jnp.where((jnp.arange(settings.max_increments) == s.increments) & accepted, fraction, s.fractions),
         path=None if s.path is None else _recorded(s, moves_on, solved),
     )
 
@@ -236,6 +235,7 @@ def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tu
     settles = (increment > 0) | (trial.missed_gap < _LEAST_SETTLING * s.missed_gap)
     missed_gap = jnp.where(settles & (trial.missed_gap > trial.no_gap), trial.missed_gap, 0.0)
     attempts = s.attempts + 1
+    exhausted = attempts >= settings.max_increments
     stepping = s._replace(
         viscosity=jnp.where(goes_on, viscosity, 0.0),
         speed=speed,
@@ -245,7 +245,8 @@ def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tu
         increments=s.increments + accepted,
         release_failed=s.release_failed | lost_hold,
         missed_gap=jnp.where(accepted, missed_gap, s.missed_gap),
-        failed=lost & ~lost_hold & (cut < settings.min_increment) | (attempts >= settings.max_increments),
+        failed=lost & ~lost_hold & (cut < settings.min_increment) | exhausted,
+        exhausted=exhausted,
         length=length,
         kept=jnp.where(accepted, length, s.kept),
     )
@@ -300,8 +301,7 @@ def _hold_balance(problem: Problem, forces: Forces, state: State) -> tuple[Array
 
 def outcome(s: Stepping) -> RESULTS:
     """Name how the solve ended."""
-    stopped = s.attempts >= s.fractions.shape[0]
-    failure = RESULTS.where(stopped, RESULTS.max_increments_reached, RESULTS.increment_too_small)
+    failure = RESULTS.where(s.exhausted, RESULTS.max_increments_reached, RESULTS.increment_too_small)
     failure = RESULTS.where(jnp.all(jnp.isfinite(s.state.u)), failure, RESULTS.nonfinite)
     success = RESULTS.where(s.state.held & s.slides, RESULTS.slides_off, RESULTS.successful)
     return RESULTS.where(s.state.fraction >= 1.0, success, failure)

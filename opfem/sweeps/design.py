@@ -192,7 +192,7 @@ def _read_axis(name: str, axis: Any) -> np.ndarray:
         raise ValueError(f"Axis {name!r} of the sweep must hold numbers or words, got {_short(values)}.")
     if values.dtype.kind == "f" and np.isnan(values).any():
         raise ValueError(f"Axis {name!r} of the sweep must not hold NaN, got {_short(values)}.")
-    return values
+    return values.astype(float) if values.dtype.kind == "f" else values
 
 
 def _short(values: np.ndarray) -> str:

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..inverse import FitStatus, TractionFit
 from ..results.dataset import FIT_STATS, IMAGE, NODES, STATS
-from ..solvers import RESULTS, Solution
+from ..solvers import CONVERGED, RESULTS, Solution
 from .design import RESERVED, known_name
 
 Keep = Sequence[str] | Callable[[Any], dict[str, Any]] | None
@@ -21,7 +21,7 @@ Keep = Sequence[str] | Callable[[Any], dict[str, Any]] | None
 STATUS = " ended"
 """How solutions ended, among the arrays of a point."""
 ERROR, NONFINITE, SUCCESSFUL = "error", "nonfinite", "successful"
-GOOD = (SUCCESSFUL, "slides_off")
+GOOD = CONVERGED
 """Statuses of points that have a result."""
 _ENDS = {"solve": RESULTS, "fit": FitStatus}
 # Equinox offers no other way from a name to its item.

@@ -66,6 +66,26 @@ def test_missing_that_is_no_number(tmp_path, path, told, command, capsys):
     assert told == []
 
 
+@pytest.mark.parametrize(
+    ("stated", "argument", "value"),
+    [
+        ("spacing = 0.5", "spacing", 0.5),
+        ("spacing = [0.5, 0.25]", "spacing", (0.5, 0.25)),
+        ("missing = 0", "missing", (0.0,)),
+        ('missing = "0,-1"', "missing", (0.0, -1.0)),
+        ("scale = 2.5", "scale", 2.5),
+        ('mask = "bad.npy"', "mask", "bad.npy"),
+    ],
+)
+def test_options_of_a_sweep_reach_the_reader(tmp_path, path, told, stated, argument, value):
+    np.save(tmp_path / "bad.npy", COUNTS < 0)
+    config = f'[inputs]\nmap = "map.npy"\nl0 = 0.5\n{stated}\n[axes]\np0 = [1.0]\n[outputs]\nkeep = ["pressure"]\n'
+    (tmp_path / "sweep.toml").write_text(config)
+    with pytest.raises(SystemExit):
+        main(["sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path / "o")])
+    assert told[0][argument] == (str(tmp_path / value) if value == "bad.npy" else value)
+
+
 def test_one_spacing_is_that_of_both_axes(path):
     read, _ = read_maps(str(path), MapOptions(l0="0.5", spacing=(0.5,), unit="um"))
     np.testing.assert_allclose(read.extent, (5.0, 2.5))

@@ -408,3 +408,14 @@ def test_demo_solves_a_sample_of_its_own(tmp_path, monkeypatch, shared, solved, 
     assert load.thickness.shape == ((502, 502) if coin else (201, 201))
     np.testing.assert_allclose(palpation.extent, 5.0)
     assert float(palpation.layer.thickness) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("l0", "message"), [(500, "got 500; is it in µm?"), (5e-4, "got 0.0005; is it in m?"), (25, "got 25; is it in µm?")]
+)
+@pytest.mark.parametrize("command", ["palpate", "fit"])
+def test_l0_in_another_unit_is_refused_before_the_solve(tmp_path, map_file, solved, capsys, command, l0, message):
+    options = ("--extent", 2, 2, "--elements", 6, 6, 2, "--std", 0.002, "--l0", l0, "--out", tmp_path / "out")
+    assert opfem(command, map_file, *options) == 1
+    assert message in capsys.readouterr().err
+    assert solved == []

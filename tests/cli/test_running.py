@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -97,6 +98,14 @@ class TestOutput:
         assert said in answer.stderr
         assert b"Traceback" not in answer.stderr
         assert b"Exception" not in answer.stderr
+
+
+def test_warnings_are_one_line_in_options(capsys):
+    with running.reporting(debug=False), warnings.catch_warnings():
+        warnings.simplefilter("always")
+        for _ in range(2):
+            warnings.warn('MAP looks like µm; pass unit="um".', UserWarning, stacklevel=1)
+    assert capsys.readouterr().err == "opfem: MAP looks like µm; pass --unit um.\n"
 
 
 class TestInterrupts:

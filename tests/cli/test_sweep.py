@@ -1,12 +1,15 @@
 """`opfem sweep`: from a file to a table, going on, and what is wrong with a file."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
 
 import opfem as op
 from opfem import cli
-from opfem.cli.sweep import _inputs, _points, _read
+from opfem.cli.statement import read_maps, state_experiment
+from opfem.cli.sweep import _AXES, _inputs, _points, _read
 from tests.tolerances import SOLVER
 
 CONFIG = """
@@ -105,6 +108,12 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys):
         ('unit = "kPa"', 'unit = ["kPa"]', "[axes] c10 unit must be one of MPa, kPa, Pa, got ['kPa']"),
         ("[0.0, 0.2]", "[0.0, true]", "[axes] window_friction [1] must be a number, got True"),
         ("[0.0, 0.2]", "[0.0, nan]", "[axes] window_friction [1] must be zero or positive, got [0.0, nan]"),
+        ("to = 4.0", "to = 1e999", "[axes] c10 [MPa] must be positive, got [2.0, inf]"),
+        (
+            "to = 4.0, points = 2",
+            "to = nan, points = 2, log = true",
+            "[axes] c10 [MPa] must be positive, got [2.0, nan]",
+        ),
         ("[0.0, 0.2]", "{ values = 0.2 }", "[axes] window_friction must hold a list of numbers, got 0.2"),
         ("smooth = 0.2", 'smooth = "0.2"', "[inputs] smooth must be a number, got '0.2'"),
         ("smooth = 0.2", "smooth = true", "[inputs] smooth must be a number, got True"),
@@ -243,6 +252,28 @@ class TestForce:
         return config.parent / "map.npy"
 
 
+def test_of_many_points_the_ends_and_some_between_are_stated(config, tmp_path, computed, monkeypatch, capsys):
+    seen = []
+
+    def state(unloaded, extent, layer, contact):
+        seen.append(layer.c10)
+        if layer.c10 == 5e-3:
+            raise ValueError("too stiff")
+
+    values = np.linspace(2.0, 4.0, 10_000)
+    values[7] = 5.0  # kPa
+    config.write_text(CONFIG.replace("{ from = 2.0, to = 4.0, points = 2, ", f"{{ values = {values.tolist()}, "))
+    monkeypatch.setattr("opfem.cli.sweep.state_palpation", state)
+    assert opfem("sweep", config, "--out", tmp_path / "out") == 1
+    assert "[axes] at c10 = 0.005: too stiff" in capsys.readouterr().err
+    values[7] = 3.0
+    seen.clear()
+    config.write_text(CONFIG.replace("{ from = 2.0, to = 4.0, points = 2, ", f"{{ values = {values.tolist()}, "))
+    assert opfem("sweep", config, "--out", tmp_path / "out") == 0
+    assert {2e-3, 4e-3} <= set(seen)
+    assert len(seen) < 300
+
+
 def test_a_file_from_notepad(config, tmp_path, computed):
     config.write_bytes(b"\xef\xbb\xbf" + CONFIG.replace("\n", "\r\n").encode())
     assert opfem("sweep", config, "--out", tmp_path / "out") == 0
@@ -272,6 +303,21 @@ def test_designs():
     assert zipped.dims == ("point",)
     log = _points({"c10": {"from": 1.0, "to": 100.0, "points": 3, "log": True, "unit": "kPa"}}, {})
     np.testing.assert_allclose(log.columns["c10"], [1e-3, 1e-2, 1e-1])
+
+
+def test_every_axis_is_a_number_of_the_experiment(config):
+    """At two values of each: stated as its option, and put in the place that the axis names."""
+    units = {"MPa": 1e-3, "mm": 0.1, "1": 0.1}
+    for name, axis in _AXES.items():
+        stated = _read(config)
+        stated["inputs"].pop(name, None)
+        points = _points({name: [1.0 * units[axis.unit], 1.5 * units[axis.unit]]}, {})
+        inputs = _inputs(stated["inputs"], points, config.parent)
+        measured, unloaded = read_maps(inputs.map, inputs.reading)
+        palpation, _ = state_experiment(measured, unloaded, inputs.reading, inputs.layer, inputs.contact)
+        assert axis.where(palpation) == pytest.approx(units[axis.unit])
+        moved = eqx.tree_at(axis.where, palpation, jnp.asarray(1.5 * units[axis.unit]))
+        assert axis.where(moved) == pytest.approx(1.5 * units[axis.unit])
 
 
 def test_inputs_are_the_options_of_palpate(config, tmp_path):

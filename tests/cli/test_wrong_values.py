@@ -203,6 +203,11 @@ def test_every_command_and_option_is_described(command):
     [
         ('Pass unit="um".', "Pass --unit um."),
         ("needs extent=(Lx, Ly) or spacing=(dx, dy)", "needs --extent Lx Ly or --spacing dx dy"),
+        (
+            "above max_missing=0.5; pass a larger max_missing= if",
+            "above --max-missing 0.5; pass a larger --max-missing if",
+        ),
+        ('pass missing=9999, or missing="none"', "pass --missing 9999, or --missing none"),
         ("pass variable= to name one of: a, b", "pass --variable to name one of: a, b"),
         ("Layer.thickness [mm] must be positive, got -0.5.", "--l0 [mm] must be positive, got -0.5."),
         ("Contact.friction [1] is", "--window-friction or --sample-friction [1] is"),

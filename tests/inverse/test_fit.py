@@ -7,6 +7,7 @@ import re
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -15,6 +16,8 @@ import opfem.inverse.fit
 from opfem.inverse.bed import lay_bed, no_bed
 from opfem.inverse.forward import Linearised, of_load, press
 from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
+from opfem.inverse.inputs import stacked
+from opfem.inverse.misfit import Misfit
 from opfem.inverse.observation import _spline_values, interface_heights, observe
 from opfem.inverse.start import on_mesh
 from opfem.mechanics.face import tributary_area
@@ -196,6 +199,13 @@ def test_errors_say_what_to_do():
     refused("hexahedra", experiment=dataclasses.replace(palpation(), element="tet10"))
     refused(r"parameters name numbers .* got 'c10'", parameters={"c10": op.Normal(1.0, 0.1)})
     refused("forces needs one for each of 1 maps, got 2", forces=[op.ForceReading(1.0, 0.1)] * 2)
+    inside = op.AxialDisplacement(np.zeros((3, 12, 13)), 1e-4)
+    refused(r"inside \[mm\].*\(nz\+1, ny\+1, nx\+1\) = \(3, 13, 13\).*got shape \(3, 12, 13\)", inside=inside)
+    jaxtyping.config.update("jaxtyping_disable", True)  # as users run it
+    refused(r"inside \[mm\].*got ndarray", inside=[np.zeros((3, 13, 13))])
+    jaxtyping.config.update("jaxtyping_disable", False)
+    fits = op.AxialDisplacement(np.zeros((3, 13, 13)), 1e-4)
+    refused("inside needs one for each of 1 maps, got 2", inside=[fits, fits])
     beside = op.ThicknessMap(np.full((11, 11), 0.45), extent=(SIDE, SIDE), std=NOISE, origin=(5.0, 0.0))
     refused("map 0 has no pixel with data on the layer", thickness=beside)
     other = op.ThicknessMap(np.full((9, 11), 0.45), extent=(SIDE, SIDE), std=NOISE)
@@ -413,6 +423,46 @@ def test_chosen_prior_is_at_most_twice_as_far_from_the_truth_as_the_best(small, 
         assert chosen.chi2 / chosen.observed == pytest.approx(1.0, abs=0.1)
 
 
+def test_displacements_inside_count_by_their_noise_where_they_were_measured(small):
+    experiment, settings, prior, _ = small
+    rng = np.random.default_rng(0)
+    u, values = rng.standard_normal((1, 3, 3, 7, 7)), rng.standard_normal((3, 7, 7))
+    std, mask = rng.uniform(0.5, 2.0, (3, 7, 7)), rng.random((3, 7, 7)) < 0.3
+    flat = op.ThicknessMap(np.full((31, 31), 0.48), extent=(SIDE, SIDE), std=NOISE)
+    observations = jax.tree.map(lambda leaf: leaf[None], observe(experiment.mesh(), flat, NOISE))
+
+    def inside(*args):
+        misfit = Misfit(
+            experiment, observations, prior, None, None, {}, None, stacked("inside", op.AxialDisplacement(*args), 1),
+            None, no_bed(experiment, observations, prior), settings.as_leaves(),
+        )  # fmt: skip
+        white = misfit.white(observations.surface)
+        return misfit.residuals(white, jnp.asarray(u), jnp.ones(1))[0]["inside"][0]
+
+    np.testing.assert_allclose(inside(values, std, mask), np.where(mask, 0.0, (u[0, 2] - values) / std), 1e-12)
+    np.testing.assert_allclose(inside(values, 0.5), 2.0 * (u[0, 2] - values), 1e-12)
+
+
+@pytest.mark.slow
+def test_displacements_inside_tell_what_a_masked_map_does_not(small):
+    """Half of the map is missing; the layer's motion, to 0.2 µm, says what presses there."""
+    experiment, settings, prior, known = small
+    mask = np.zeros((31, 31), bool)
+    mask[:, :16] = True
+    u = op.solve(experiment, op.Traction(known, stiffness=0.0), settings).displacement
+    std = 2e-4
+    measured = u[2] + std * np.random.default_rng(4).standard_normal(u[2].shape)
+    fits = [
+        op.fit_traction(
+            experiment, small_map(small, mask=mask), prior, solver=settings, draws=4, progress=False, inside=inside
+        )
+        for inside in (None, op.AxialDisplacement(measured, std))
+    ]
+    without, told = (float(jnp.sqrt(jnp.mean((fit.normal - known)[:, :3] ** 2))) for fit in fits)
+    assert told < 0.3 * without
+    assert jnp.mean(fits[1].normal_std[:, :3]) < 0.5 * jnp.mean(fits[0].normal_std[:, :3])
+
+
 @pytest.mark.slow
 def test_mean_pressure_under_a_bonded_nearly_incompressible_layer_is_named(small):
     """VALIDATION.md test 40: it hardly moves the interface, and rests on the prior."""
@@ -458,7 +508,7 @@ def looked_along(misfit):
 
     rtol, number = jnp.asarray(1e-2), jnp.asarray
     descent = PreconditionedDescent(lambda J: lambda g: g, rtol, number(60), number(0.03), number(jnp.inf))
-    solver = GaussNewton(rtol, rtol, descent)
+    solver = GaussNewton(rtol, descent)
     state = solver.init(followed, y := jnp.zeros(3), None, {}, *jax.eval_shape(followed, y, None), frozenset())
     for _ in range(6):
         y, state, _ = solver.step(followed, y, None, {}, state, frozenset())

@@ -24,7 +24,7 @@ def test_settles_where_residuals_curve_more_than_gauss_newton_knows():
     descent = PreconditionedDescent(
         lambda J: lambda g: g, jnp.asarray(1e-2), jnp.asarray(60), jnp.asarray(1e-6), jnp.asarray(jnp.inf)
     )
-    solver = GaussNewton(rtol, rtol, descent)
+    solver = GaussNewton(rtol, descent)
     solution = optx.least_squares(residuals, solver, jnp.zeros(20), max_steps=45, throw=False)
     assert solution.result == optx.RESULTS.successful
 

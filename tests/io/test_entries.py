@@ -156,6 +156,26 @@ class TestInflation:
         with pytest.raises(MeasurementError, match="is damaged: a chunk inflates to more than max_bytes=1000000"):
             read(tmp_path / "a.h5", max_bytes=10**6)
 
+    def test_chunk_larger_than_its_array(self, tmp_path):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            node = file.create_dataset(
+                "L1", (4, 6), "f8", chunks=(1000, 1000), maxshape=(None, None), compression="gzip"
+            )
+            node[:] = VALUES
+        with pytest.raises(
+            MeasurementError, match=r"shape \(1000, 1000\) takes 8 MB once loaded, above max_bytes=1000000"
+        ):
+            read(tmp_path / "a.h5", max_bytes=10**6)
+        np.testing.assert_array_equal(read(tmp_path / "a.h5"), VALUES)
+
+    def test_tile_larger_than_its_image(self, tmp_path):
+        tifffile.imwrite(tmp_path / "a.tif", VALUES, tile=(1024, 1024), compression="zlib")
+        with pytest.raises(
+            MeasurementError, match=r"shape \(1024, 1024\) takes 8 MB once loaded, above max_bytes=1000000"
+        ):
+            read(tmp_path / "a.tif", max_bytes=10**6)
+        np.testing.assert_array_equal(read(tmp_path / "a.tif"), VALUES)
+
     def test_of_a_strip(self, tmp_path, monkeypatch):
         tifffile.imwrite(tmp_path / "a.tif", VALUES, compression="zlib")
         with tifffile.TiffFile(tmp_path / "a.tif") as file:
@@ -165,7 +185,9 @@ class TestInflation:
             size = 2 if tag.dtype == 3 else 4
             stored[tag.valueoffset : tag.valueoffset + size] = value.to_bytes(size, "little")
         (tmp_path / "a.tif").write_bytes(stored + self.BOMB)
-        with pytest.raises(MeasurementError, match="a strip of an image of 192 bytes inflates to more"):
+        with pytest.raises(
+            MeasurementError, match="is damaged: a part of an image inflates to more than its 192 bytes"
+        ):
             read(tmp_path / "a.tif")
 
     @pytest.mark.parametrize("save", [save_mat5_small, save_npz])

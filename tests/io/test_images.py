@@ -25,9 +25,10 @@ class TestCompressions:
         got = read_thickness(tmp_path / "a.tif", extent=EXTENT, unit="um")
         np.testing.assert_allclose(got.values, 1e-3 * COUNTS, ROUNDOFF)
 
-    @pytest.mark.parametrize("compression", ["zlib", "lzma"])
-    def test_of_64_bits(self, tmp_path, compression):
-        tifffile.imwrite(tmp_path / "a.tif", 1e-3 * COUNTS, compression=compression)
+    @pytest.mark.parametrize("compression", ["zlib", "lzma", None])
+    @pytest.mark.parametrize("layout", [{}, {"tile": (16, 32)}, {"rowsperstrip": 3}, {"bigtiff": True}], ids=str)
+    def test_of_64_bits(self, tmp_path, compression, layout):
+        tifffile.imwrite(tmp_path / "a.tif", 1e-3 * COUNTS, compression=compression, **layout)
         np.testing.assert_array_equal(read_thickness(tmp_path / "a.tif", extent=EXTENT).values, 1e-3 * COUNTS)
 
     def test_second_image_by_lzw(self, tmp_path):

@@ -24,7 +24,7 @@ TANGENT_FROM = 6.0
 
 def pressure_and_slope(law, clearance):
     clearance = jnp.asarray(clearance, float)
-    return jax.jvp(lambda g: law.pressure(g, SCALE), (clearance,), (jnp.ones_like(clearance),))
+    return jax.jvp(lambda g: law.pressure_at(g, SCALE), (clearance,), (jnp.ones_like(clearance),))
 
 
 def exponential(clearance, p0=P0, c0=C0):
@@ -70,8 +70,8 @@ def test_22_exponential_law_has_one_slope_at_its_joints(where, slope):
 
 def test_exponential_law_ends_at_its_clearance():
     assert LAW.zero_pressure_clearance == C0
-    assert LAW.pressure(jnp.asarray(C0), SCALE) == 0.0
-    assert LAW.pressure(jnp.asarray(C0 * (1 - 1e-6)), SCALE) > 0.0
+    assert LAW.pressure_at(jnp.asarray(C0), SCALE) == 0.0
+    assert LAW.pressure_at(jnp.asarray(C0 * (1 - 1e-6)), SCALE) > 0.0
 
 
 @ALL_LAWS
@@ -82,7 +82,7 @@ def test_22_laws_are_finite_a_thousand_clearances_away(law, side):
     assert np.isfinite(p)
     assert np.isfinite(slope)
     assert (p > 0 and slope < 0) if side < 0 else (p == 0 and slope == 0)
-    by_law = jax.grad(lambda model: model.pressure(far, SCALE))(law)
+    by_law = jax.grad(lambda model: model.pressure_at(far, SCALE))(law)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_law))
 
 
@@ -91,7 +91,7 @@ def test_slope_equals_a_central_difference(law):
     clearance = C0 * np.array([-7.5, -3.0, -0.2, 0.3, 0.8, 1.5])
     step = 1e-6 * C0
     difference = (
-        law.pressure(jnp.asarray(clearance + step), SCALE) - law.pressure(jnp.asarray(clearance - step), SCALE)
+        law.pressure_at(jnp.asarray(clearance + step), SCALE) - law.pressure_at(jnp.asarray(clearance - step), SCALE)
     ) / (2 * step)
     slope = pressure_and_slope(law, clearance)[1]
     np.testing.assert_allclose(slope, difference, FINITE_DIFFERENCE, FINITE_DIFFERENCE * np.abs(slope).max())
@@ -99,20 +99,20 @@ def test_slope_equals_a_central_difference(law):
 
 def test_linear_and_hard_laws_are_lines():
     clearance = jnp.array([-0.02, -0.01, 0.01])
-    np.testing.assert_allclose(op.LinearOverclosure(7.0).pressure(clearance, SCALE), [0.14, 0.07, 0.0], ROUNDOFF)
-    hard = op.HardOverclosure(stiffness_ratio=20.0).pressure(clearance, SCALE)
+    np.testing.assert_allclose(op.LinearOverclosure(7.0).pressure_at(clearance, SCALE), [0.14, 0.07, 0.0], ROUNDOFF)
+    hard = op.HardOverclosure(stiffness_ratio=20.0).pressure_at(clearance, SCALE)
     np.testing.assert_allclose(hard, [0.2, 0.1, 0.0], ROUNDOFF)
     assert op.HardOverclosure().zero_pressure_clearance == 0.0
     assert op.LinearOverclosure(7.0).zero_pressure_clearance == 0.0
 
 
 def test_tabular_law_passes_through_its_rows_and_goes_straight_on():
-    rows = np.column_stack([TABLE.clearances, TABLE.pressures])
+    rows = np.column_stack([TABLE.clearance, TABLE.pressure])
     between = 0.5 * (rows[1:] + rows[:-1])
     beyond = rows[-1] + 10 * (rows[-1] - rows[-2])
     points = np.vstack([[[1.0, 0.0]], rows, between, beyond])
-    np.testing.assert_allclose(TABLE.pressure(jnp.asarray(points[:, 0]), SCALE), points[:, 1], ROUNDOFF, 1e-16)
-    np.testing.assert_allclose(TABLE.clearance(jnp.asarray(points[1:, 1]), SCALE), points[1:, 0], ROUNDOFF, 1e-16)
+    np.testing.assert_allclose(TABLE.pressure_at(jnp.asarray(points[:, 0]), SCALE), points[:, 1], ROUNDOFF, 1e-16)
+    np.testing.assert_allclose(TABLE.clearance_at(jnp.asarray(points[1:, 1]), SCALE), points[1:, 0], ROUNDOFF, 1e-16)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_a_point_that_just_touches_is_held(law):
 @ALL_LAWS
 def test_clearance_is_the_inverse_of_pressure_over_twelve_decades(law):
     p = P0 * np.logspace(-8, 4, 97)
-    clearance = law.clearance(jnp.asarray(p), SCALE)
+    clearance = law.clearance_at(jnp.asarray(p), SCALE)
     got, slope = pressure_and_slope(law, clearance)
     # Near its start a law has lost the digits of the distance from there, which makes its pressure.
     lost = 4 * EPS * np.abs(clearance * slope) / p
@@ -136,27 +136,27 @@ def test_clearance_is_the_inverse_of_pressure_over_twelve_decades(law):
 
 
 def test_23_clearance_of_the_exponential_law_at_ten_kpa():
-    np.testing.assert_allclose(LAW.clearance(jnp.asarray(0.01), SCALE), 9.094e-3, atol=0.5e-6)
+    np.testing.assert_allclose(LAW.clearance_at(jnp.asarray(0.01), SCALE), 9.094e-3, atol=0.5e-6)
 
 
 @ALL_LAWS
 def test_clearance_of_no_pressure_is_where_pressure_starts(law):
-    assert law.clearance(jnp.asarray(0.0), SCALE) == law.zero_pressure_clearance
+    assert law.clearance_at(jnp.asarray(0.0), SCALE) == law.zero_pressure_clearance
 
 
 @ALL_LAWS
 def test_slope_of_the_inverse_is_the_inverse_slope(law):
     p = jnp.asarray(P0 * np.logspace(-6, 3, 10))
-    clearance, slope = jax.jvp(lambda v: law.clearance(v, SCALE), (p,), (jnp.ones_like(p),))
+    clearance, slope = jax.jvp(lambda v: law.clearance_at(v, SCALE), (p,), (jnp.ones_like(p),))
     np.testing.assert_allclose(slope * pressure_and_slope(law, clearance)[1], 1.0, atol=FINITE_DIFFERENCE)
 
 
 @ALL_LAWS
 def test_jit_equals_eager_and_vmap_a_loop(law):
     clearance = jnp.asarray(C0 * np.linspace(-7.5, 1.5, 7))
-    eager = law.pressure(clearance, SCALE)
-    np.testing.assert_allclose(jax.jit(lambda g: law.pressure(g, SCALE))(clearance), eager, ROUNDOFF)
-    np.testing.assert_allclose(jax.vmap(lambda g: law.pressure(g, SCALE))(clearance), eager, ROUNDOFF)
+    eager = law.pressure_at(clearance, SCALE)
+    np.testing.assert_allclose(jax.jit(lambda g: law.pressure_at(g, SCALE))(clearance), eager, ROUNDOFF)
+    np.testing.assert_allclose(jax.vmap(lambda g: law.pressure_at(g, SCALE))(clearance), eager, ROUNDOFF)
 
 
 @pytest.mark.parametrize(

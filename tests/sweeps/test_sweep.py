@@ -10,7 +10,9 @@ import pytest
 import xarray as xr
 
 import opfem as op
+from opfem.solvers import CONVERGED
 from opfem.solvers.progress import Progress
+from opfem.sweeps.outputs import GOOD
 from opfem.sweeps.progress import SweepProgress
 from tests.tolerances import ROUNDOFF
 
@@ -24,6 +26,10 @@ def work(force, distance):
 
 def same(a: xr.Dataset, b: xr.Dataset) -> bool:
     return a.drop_vars("wall_time").drop_attrs().identical(b.drop_vars("wall_time").drop_attrs())
+
+
+def test_a_solve_that_kept_its_fields_has_a_result_in_a_sweep():
+    assert set(GOOD) == set(CONVERGED)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -109,8 +109,8 @@ class Spectra(AbstractGrid):
             raise ValueError("Spectra.chirp must grow from pixel to pixel; turn a falling one round, and the spectra.")
         if not np.max(np.asarray(self.reference)) > 0:
             raise ValueError("Spectra.reference must be positive somewhere; is it dark?")
-        self.spacing = pair("Spectra.spacing (dx, dy)", spacing, float)
-        self.origin = pair("Spectra.origin (x, y)", origin, float)
+        self.spacing = pair("Spectra.spacing (dx, dy)", spacing)
+        self.origin = pair("Spectra.origin (x, y)", origin)
         self.optical_spacing = jnp.asarray(optical_spacing, float)
         self.wavelength = None if wavelength is None else jnp.asarray(wavelength, float)
         self.is_ascending = is_ascending

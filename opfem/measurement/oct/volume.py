@@ -98,8 +98,8 @@ class OctVolume(AbstractGrid):
             raise ValueError(f"OctVolume.phase_sign must be 1, -1 or None, got {phase_sign!r}.")
         if wavelength is not None:
             check_wavelength("OctVolume.wavelength", wavelength)
-        self.spacing = pair("OctVolume.spacing (dx, dy)", spacing, float)
-        self.origin = pair("OctVolume.origin (x, y)", origin, float)
+        self.spacing = pair("OctVolume.spacing (dx, dy)", spacing)
+        self.origin = pair("OctVolume.origin (x, y)", origin)
         self.optical_spacing = jnp.asarray(optical_spacing, float)
         self.depth_origin = jnp.asarray(depth_origin, float)
         self.wavelength = None if wavelength is None else jnp.asarray(wavelength, float)
