@@ -114,9 +114,9 @@ class ThicknessMap(AbstractGrid):
             )
         if extent is None:
             steps_between = jnp.array([shape[1] - 1, shape[0] - 1], dtype)
-            spacing = pair("ThicknessMap.spacing (dx, dy)", spacing)
+            spacing = as_leaf(spacing, "ThicknessMap.spacing (dx, dy)", "mm")
             check_positive("ThicknessMap.spacing (dx, dy)", "mm", spacing)
-            self.extent = spacing * steps_between
+            self.extent = pair("ThicknessMap.spacing (dx, dy)", spacing) * steps_between
         else:
             self.extent = pair("ThicknessMap.extent (Lx, Ly)", extent)
         self.origin = pair("ThicknessMap.origin (x, y)", origin)

@@ -268,3 +268,46 @@ def test_linear_power_is_written_as_decibels(tmp_path):
     op.write_oct(written, tmp_path / "a.oct")
     read = op.read_oct(tmp_path / "a.oct")
     np.testing.assert_allclose(read.intensity(), written.values, rtol=1e-5)  # float32 of 16 dB
+
+
+def test_raw_spectra_of_a_thorlabs_file(tmp_path):
+    """Mirrors in two B-scans of raw spectra, with apodisation lines, offset and chirp, come back at their depths."""
+    pixels, lines = 1024, 3
+    wavelength = np.linspace(830e-6, 930e-6, pixels)  # mm; short to long, as Thorlabs' spectrometers
+    k = 2 * np.pi / wavelength
+    chirp = (k[0] - k) / (k[0] - k[-1]) * (pixels - 1)
+    light = 2e4 * np.exp(-0.5 * ((wavelength - 880e-6) / 30e-6) ** 2)
+    offset = np.full(pixels, 90.0, "<f4")
+    depths = np.array([[0.2, 0.4], [0.6, 0.8]])  # mm, as in air
+    dark = np.broadcast_to(light, (2, lines, pixels))
+    fringes = light * (1 + 0.3 * np.cos(2 * k * depths[..., None]))
+    counts = np.concatenate([dark, fringes], axis=1) + offset
+    reach = np.pi / (k[0] - k[-1]) * (pixels - 1) / 2  # mm that the volume covers
+    part = '<DataFile Type="Raw" SizeZ="1024" SizeX="5" SizeY="1" RangeZ="{}" RangeX="0.02" RangeY="0.01" '
+    part += 'BytesPerPixel="2" ApoRegionStart0="0" ApoRegionEnd0="3" ScanRegionStart0="3" ScanRegionEnd0="5">'
+    part += "data\\Spectral{}.data</DataFile>"
+    vector = '<DataFile Type="Real" SizeZ="1024" BytesPerPixel="4">data\\{}.data</DataFile>'
+    files = "".join(part.format(float(reach), row) for row in range(2)) + vector.format("Chirp")
+    header = (
+        f"<Ocity><DataFiles>{files}{vector.format('OffsetErrors')}</DataFiles>"
+        "<Instrument><RawDataIsSigned>False</RawDataIsSigned><CentralWavelength>880</CentralWavelength></Instrument></Ocity>"
+    )
+    with zipfile.ZipFile(tmp_path / "a.oct", "w") as archive:
+        archive.writestr("Header.xml", header)
+        archive.writestr("data\\Chirp.data", chirp.astype("<f4").tobytes())
+        archive.writestr("data\\OffsetErrors.data", offset.tobytes())
+        for row in range(2):
+            archive.writestr(f"data\\Spectral{row}.data", np.round(counts[row]).astype("<u2").tobytes())
+    spectra = op.read_spectra(tmp_path / "a.oct", spacing=(0.01, 0.01))
+    assert spectra.shape == (2, 2, pixels)
+    np.testing.assert_allclose(spectra.reference, light, atol=0.6)
+    volume = op.read_oct(tmp_path / "a.oct", spacing=(0.01, 0.01))
+    assert volume.scale == "complex"
+    assert volume.phase_sign == -1
+    power = np.log(volume.intensity())
+    top = np.argmax(power[..., 8:-8], axis=2) + 8
+    low, mid, high = (np.take_along_axis(power, top[..., None] + step, axis=2)[..., 0] for step in (-1, 0, 1))
+    found = (top + 0.5 * (low - high) / (low - 2 * mid + high)) * float(volume.optical_spacing)
+    np.testing.assert_allclose(found, depths, atol=0.5e-3)
+    with pytest.raises(op.MeasurementError, match="holds no intensity; it holds Spectral0"):
+        op.read_oct(tmp_path / "a.oct", quantity="intensity")

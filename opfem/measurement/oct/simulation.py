@@ -7,7 +7,7 @@ within its cells. The same key gives the same bits, however the volume is divide
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -52,15 +52,6 @@ SAMPLE = Medium(0.0, 3.0)
 """A scattering sample; tissue has an attenuation of 5 to 10 /mm."""
 
 _ROLL_OFF = (6.0, 1.5)  # dB of power lost at this optical depth [mm]; Gaussian
-
-
-class _Optics(NamedTuple):
-    """Numbers of a simulation that shape its program."""
-
-    columns: int  # sub-columns of scatterers in a pixel, along x and y
-    axial: tuple[float, ...]
-    across_x: tuple[float, ...]
-    across_y: tuple[float, ...]
 
 
 def simulate_oct(
@@ -223,8 +214,7 @@ class _Scene:
         x, y = np.arange(nx) * self.spacing[0], np.arange(ny) * self.spacing[1]
         depth = np.asarray(self.surface(*np.meshgrid(x, y)), float)
         levels = np.arange(self.levels) * self.dz
-        amplitude_layer, amplitude, fade, _, roll_off = self._numbers()
-        del amplitude_layer
+        _, amplitude, fade, _, roll_off = self._numbers()
         level = amplitude * np.exp(-fade * depth - roll_off * depth**2)  # of the sample's field at its surface
         extra = np.zeros(self.levels, np.complex64)
         for place, decibels in lines:
