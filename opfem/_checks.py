@@ -66,7 +66,8 @@ def _number(field: str, unit: str, value: Any, holds, expected: str) -> None:
     if known.dtype.kind not in "fiu":
         raise ValueError(f"{field} [{unit}] must be a number, got {value!r}.")
     if not np.all(np.isfinite(known)) or not np.all(holds(known)):
-        got = known.item() if known.ndim == 0 else f"values from {known.min():g} to {known.max():g}"
+        low, high = known.min(), known.max()
+        got = f"values from {low:g} to {high:g}" if low < high else low.item()
         raise ValueError(f"{field} [{unit}] must be {expected}, got {got}.")
 
 
