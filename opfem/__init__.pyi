@@ -23,8 +23,11 @@ from .inverse import (
 from .io import (
     Checkpoint as Checkpoint,
     read_netcdf as read_netcdf,
+    read_oct as read_oct,
+    read_spectra as read_spectra,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
+    write_oct as write_oct,
     write_pvd as write_pvd,
     write_thickness as write_thickness,
     write_vtu as write_vtu,
@@ -33,6 +36,21 @@ from .measurement import (
     MeasurementError as MeasurementError,
     MeasurementWarning as MeasurementWarning,
     ThicknessMap as ThicknessMap,
+)
+from .measurement.oct import (
+    EDGES as EDGES,
+    LAYER as LAYER,
+    SAMPLE as SAMPLE,
+    SCATTERING_LAYER as SCATTERING_LAYER,
+    UWA_845NM as UWA_845NM,
+    Interface as Interface,
+    Medium as Medium,
+    OctSystem as OctSystem,
+    OctVolume as OctVolume,
+    Spectra as Spectra,
+    find_interface as find_interface,
+    simulate_oct as simulate_oct,
+    thickness_from_oct as thickness_from_oct,
 )
 from .model import (
     Bonded as Bonded,
@@ -55,6 +73,7 @@ from .model import (
 )
 from .plot import (
     plot_fit as plot_fit,
+    plot_interface as plot_interface,
     plot_layer as plot_layer,
     plot_pressure as plot_pressure,
     plot_report as plot_report,
@@ -63,7 +82,13 @@ from .plot import (
     plot_thickness as plot_thickness,
     plot_uncertainty as plot_uncertainty,
 )
-from .results import layer_fields as layer_fields, summary as summary, to_xarray as to_xarray
+from .results import (
+    OctScene as OctScene,
+    layer_fields as layer_fields,
+    oct_scene as oct_scene,
+    summary as summary,
+    to_xarray as to_xarray,
+)
 from .solvers import (
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,

@@ -15,6 +15,11 @@ PRINTED = {
         r"pressure inside: difference 0\.\d\d%",
         r"kinetic 0\.\d\d%, missing 0\.\d+%",
     ],
+    "oct": [
+        r"interface: bias [+-]0\.[0-3]\d µm, rms 0\.\d\d µm",
+        r"its std: 9[0-8]% of pixels within two",
+        r"pressure: difference [0-4]\.\d%",
+    ],
     "stress_map": [r"force 0\.\d+ N", r"C10: [+-]\d\.\d\d % per %"],
     "traction_fit": [
         r"chi2 per degree of freedom (0\.[4-9]|1\.[012])",

@@ -4,6 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -21,15 +22,22 @@ def blocks(language):
 
 @pytest.fixture
 def own_map(tmp_path, monkeypatch):
-    """A complete map.mat, as MATLAB would write it, in the current folder."""
+    """A complete map.mat, as MATLAB would write it, and a volume scan.oct, in the current folder."""
     monkeypatch.chdir(tmp_path)
     values = np.asarray(op.datasets.example().filled().values)
     scipy.io.savemat("map.mat", {"thickness": values})
+    volume = op.simulate_oct(
+        op.UWA_845NM, lambda x, y: 0.42 + 0.02 * x, key=jax.random.key(0), spacing=(0.0125, 0.0125), shape=(40, 40),
+        media=(op.Medium(-15.0, 0.5), op.SAMPLE),
+    )  # fmt: skip
+    op.write_oct(volume, "scan.oct")
 
 
 def test_python(own_map):
-    code, _, swept = blocks("python")
-    names = {}
+    found, code, _, swept = blocks("python")
+    names = {"op": op}
+    exec(compile(found, "README.md", "exec"), names)
+    assert float(names["loaded"].std.max()) < 0.01
     exec(compile(code, "README.md", "exec"), names)
     assert 0 < float(names["data"].pressure.mean()) < 0.1
     exec(compile(swept, "README.md", "exec"), names)
@@ -42,7 +50,7 @@ def test_python(own_map):
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_fit(own_map):
-    code, fitted, _ = blocks("python")
+    _, code, fitted, _ = blocks("python")
     assert "(40, 40, 4)" in code  # which takes minutes on 2 cores
     names = {}
     exec(compile(code.replace("(40, 40, 4)", "(20, 20, 2)") + fitted, "README.md", "exec"), names)

@@ -15,12 +15,16 @@ from .options import (
     FitLayerOptions,
     FitOptions,
     ImprintOptions,
+    InterfaceOptions,
     LayerOptions,
     MapOptions,
+    MicroscopeOptions,
     RunOptions,
     SolverOptions,
     StepOptions,
+    VolumeOptions,
 )
+from .quantities import positive
 from .running import complain, reporting
 
 MISUSED = 2
@@ -46,7 +50,7 @@ _Map = Annotated[
     str,
     Parameter(
         name="MAP",
-        help="Loaded thickness (.mat, .npy, .npz, .tif, .csv), or the word example for a built-in one.",
+        help="Loaded thickness (.mat, .npy, .npz, .tif, .csv), an OCT volume (.oct), or the word example.",
     ),
 ]
 _Out = Annotated[Path, Parameter(help="Folder of the results.")]
@@ -130,6 +134,34 @@ def sweep(
 
     with reporting(run.debug):
         sweep(config, out, resume, run)
+
+
+@app.command
+def oct(
+    loaded: Annotated[
+        str, Parameter(name="LOADED", help="OCT volume of the loaded layer: .oct, .h5, .mat, .npy, .tif, raw.")
+    ],
+    /,
+    *,
+    out: _Out,
+    unloaded: Annotated[str | None, Parameter(help="OCT volume of the unloaded layer.")] = None,
+    l0: Annotated[
+        float | None, Parameter(help="Unloaded thickness in mm, instead of a volume.", validator=positive("mm"))
+    ] = None,
+    reading: VolumeOptions = VolumeOptions(),
+    microscope: MicroscopeOptions = MicroscopeOptions(),
+    asked: InterfaceOptions = InterfaceOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Measure the thickness of the layer in an OCT volume.
+
+    Writes thickness.npz, which palpate and fit take with its noise and mask, unloaded.npz with --unloaded,
+    interface.npz, summary.json and two pictures: bscans.png, the first thing to look at, and maps.png.
+    """
+    from .oct import measure
+
+    with reporting(run.debug):
+        measure(loaded, out, unloaded, l0, reading, microscope, asked, run)
 
 
 @app.command

@@ -96,6 +96,83 @@ class MapOptions:
     ] = None
 
 
+@Parameter(name="*", group=Group("Volume", sort_key=1))
+@dataclass(frozen=True)
+class VolumeOptions:
+    """How to read OCT volumes; those of Thorlabs and of opfem need none of it."""
+
+    spacing: Annotated[
+        tuple[float, float] | None,
+        Parameter(help="DX DY between A-lines in mm.", validator=positive("mm", "two positive numbers")),
+    ] = None
+    depth_spacing: Annotated[
+        float | None, Parameter(help="Distance between samples in depth in mm, as in air.", validator=positive("mm"))
+    ] = None
+    index_applied: Annotated[
+        float | None,
+        Parameter(
+            help="Index that depths of the file were divided by. Default: the file's own, or 1.",
+            validator=positive("-"),
+        ),
+    ] = None
+    shape: Annotated[tuple[int, int, int] | None, Parameter(help="NY NX NZ of a file of nothing but numbers.")] = None
+    order: Annotated[str | None, Parameter(help='Axes as stored, the fastest first, such as "zxy".')] = None
+    dtype: Annotated[str | None, Parameter(help="Type of those numbers. Default: <f4.")] = None
+    scale: Annotated[Literal["db", "linear", "complex"] | None, Parameter(help="What the file's numbers are.")] = None
+    variable: Annotated[str | None, Parameter(help="Name of the array, where a file holds several.")] = None
+    quantity: Annotated[
+        Literal["auto", "intensity", "complex", "spectra"], Parameter(help="What to take of a file that holds several.")
+    ] = "auto"
+
+
+@Parameter(name="*", group=Group("Microscope", sort_key=2))
+@dataclass(frozen=True)
+class MicroscopeOptions:
+    """The microscope; the defaults are that of the published maps."""
+
+    wavelength: Annotated[float, Parameter(help="Central wavelength in mm.", validator=positive("mm"))] = 845e-6
+    axial_fwhm: Annotated[
+        float, Parameter(help="FWHM of a point's intensity along depth, in the layer, in mm.", validator=positive("mm"))
+    ] = 7.8e-3
+    lateral_fwhm: Annotated[float, Parameter(help="The same across in mm.", validator=positive("mm"))] = 11e-3
+    index: Annotated[float, Parameter(help="Group index of the layer.", validator=positive("-"))] = 1.4
+
+
+@Parameter(name="*", group=Group("Interface", sort_key=3))
+@dataclass(frozen=True)
+class InterfaceOptions:
+    """What to look for."""
+
+    edge: Annotated[
+        Literal["auto", "brighter", "darker", "peak"],
+        Parameter(help="The sample is brighter or darker than the layer, or reflects; auto chooses."),
+    ] = "auto"
+    search: Annotated[
+        tuple[float, float] | None,
+        Parameter(help="FROM TO in depth in mm. Default: 0.03 to the end.", validator=not_negative("mm")),
+    ] = None
+    max_slope: Annotated[float, Parameter(help="Largest slope of the interface.", validator=positive("-"))] = 0.6
+    average: Annotated[float, Parameter(help="FWHM of the lateral average in mm.", validator=positive("mm"))] = 0.06
+    confidence: Annotated[
+        float,
+        Parameter(help="Pixels of less are masked.", validator=Quantity("1", "a number from 0 to 1", 0.0, 1.0)),
+    ] = 0.5
+    mask: Annotated[
+        str | None,
+        Parameter(
+            help="Image or array of the A-lines that are no data: 0 is data, all else is not.",
+            validator=OldFile("an image or array"),
+        ),
+    ] = None
+    window: Annotated[
+        Literal["first_pixel", "find"],
+        Parameter(help="The layer begins at the zero delay (common path), or at a reflection to be found."),
+    ] = "first_pixel"
+    tilt: Annotated[Literal["none", "plane"], Parameter(help="Correct for the tilt of a window that is found.")] = (
+        "none"
+    )
+
+
 @Parameter(name="*", group=Group("Layer", sort_key=2))
 @dataclass(frozen=True)
 class LayerOptions:

@@ -17,7 +17,15 @@ from ..io import read_thickness
 from ..measurement import EXAMPLE_LAYER, MeasurementError, MeasurementWarning, ThicknessMap, example_map
 from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
 from .messages import in_options
-from .options import PUBLISHED_BULK, PUBLISHED_C01, PUBLISHED_C10, ContactOptions, LayerOptions, MapOptions
+from .options import (
+    PUBLISHED_BULK,
+    PUBLISHED_C01,
+    PUBLISHED_C10,
+    ContactOptions,
+    InterfaceOptions,
+    LayerOptions,
+    MapOptions,
+)
 
 _SHARED = ("extent", "unit", "scale", "max_missing")  # by the loaded and the unloaded map
 
@@ -83,7 +91,19 @@ def _of_l0(read: Callable[[], ThicknessMap]) -> ThicknessMap:
 
 
 def _read(path: str, **how: Any) -> ThicknessMap:
-    """Read a map, and say what is odd."""
+    """Read a map, or measure it in an OCT volume, and say what is odd."""
+    from .oct import find_thickness, is_volume, read_volume
+
+    if is_volume(path):
+        given = [
+            name for name in ("extent", "spacing", "std", "variable", "scale", "missing") if how.get(name) is not None
+        ]
+        if given:
+            options = ", ".join(f"--{name}" for name in given)
+            raise ValueError(
+                f"{path} is an OCT volume and knows its grid and noise; leave out {options}, or use opfem oct."
+            )
+        return find_thickness(read_volume(path), path, asked=InterfaceOptions(mask=how.get("mask")))[1]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", MeasurementWarning)
         read = read_thickness(path, **how)

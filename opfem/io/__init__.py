@@ -4,6 +4,7 @@ from ..measurement import MeasurementError
 from .atomic import finish, take_place, whole_file, write_together
 from .checkpoint import Checkpoint as Checkpoint
 from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
+from .oct import read_oct, read_spectra, write_oct
 from .thickness import read_thickness, write_thickness
 from .vtk import layer_grid, vtu_bytes, write_pvd, write_vtu
 
@@ -13,11 +14,14 @@ __all__ = [
     "layer_grid",
     "netcdf_bytes",
     "read_netcdf",
+    "read_oct",
+    "read_spectra",
     "read_thickness",
     "take_place",
     "vtu_bytes",
     "whole_file",
     "write_netcdf",
+    "write_oct",
     "write_pvd",
     "write_thickness",
     "write_together",

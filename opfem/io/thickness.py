@@ -15,13 +15,11 @@ import numpy as np
 
 from ..measurement import MeasurementError, MeasurementWarning, Step, ThicknessMap
 from ..measurement.checks import THICKEST, THINNEST, doubtful_unit, off_square, piles
+from ..measurement.grid import LENGTH_UNITS as UNITS
 from .array_files import Entry, guarded, read_arrays
 from .atomic import whole_file
 from .entry import MAX_BYTES
 from .masks import read_mask
-
-UNITS = {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "m": 1e3}  # both code points of µ
-"""Size of each accepted unit of thickness [mm]."""
 
 _FORMAT = "opfem thickness map 1"
 _OTHER_SPACING = 0.01  # relative; files state pixel sizes to three digits at least

@@ -10,15 +10,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import wadler_lindig as wl
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._checks import as_leaf, check_non_negative, check_positive, concrete
 from .._repr import quantity
 from .._types import Map, Mask, Pair, Points, Scalar, ScalarLike
 from .checks import check_grid, check_map_shape, check_mask, check_std, check_thickness
 from .filtering import WHITE_NOISE_LENGTH, smooth, smoothed_variance
+from .grid import AbstractGrid, bilinear, kept, pair
 from .inpainting import harmonic_fill
-from .interpolation import bilinear
 
 # A sample counts as used by an interpolated point above this weight; below it is round-off of a grid line.
 _USED = 1e-6
@@ -40,7 +40,7 @@ class Step(eqx.Module):
         self.numbers = {key: jnp.asarray(value) for key, value in numbers.items()}
 
 
-class ThicknessMap(eqx.Module):
+class ThicknessMap(AbstractGrid):
     """Thickness of the layer at every pixel.
 
     Samples sit on points, not in cells; outside them the surface continues at its edge value.
@@ -114,12 +114,12 @@ class ThicknessMap(eqx.Module):
             )
         if extent is None:
             steps_between = jnp.array([shape[1] - 1, shape[0] - 1], dtype)
-            spacing = _pair("spacing (dx, dy)", spacing)
+            spacing = as_leaf(spacing, "ThicknessMap.spacing (dx, dy)", "mm")
             check_positive("ThicknessMap.spacing (dx, dy)", "mm", spacing)
-            self.extent = spacing * steps_between
+            self.extent = pair("ThicknessMap.spacing (dx, dy)", spacing) * steps_between
         else:
-            self.extent = _pair("extent (Lx, Ly)", extent)
-        self.origin = _pair("origin (x, y)", origin)
+            self.extent = pair("ThicknessMap.extent (Lx, Ly)", extent)
+        self.origin = pair("ThicknessMap.origin (x, y)", origin)
         self.mask = jnp.zeros(shape, bool) if mask is None else jnp.asarray(mask)
         self.std = None if std is None else as_leaf(std, "ThicknessMap.std", "mm")
         self.noise_length = as_leaf(noise_length, "ThicknessMap.noise_length", "mm")
@@ -158,16 +158,6 @@ class ThicknessMap(eqx.Module):
         """Distance between samples (dx, dy) [mm]."""
         ny, nx = self.shape
         return self.extent[0] / (nx - 1), self.extent[1] / (ny - 1)
-
-    @property
-    def x(self) -> Float[Array, " nx"]:
-        """Positions of the image columns [mm]."""
-        return self.origin[0] + self.spacing[0] * jnp.arange(self.shape[1])
-
-    @property
-    def y(self) -> Float[Array, " ny"]:
-        """Positions of the image rows [mm]."""
-        return self.origin[1] + self.spacing[1] * jnp.arange(self.shape[0])
 
     def filled(self) -> "ThicknessMap":
         """Fill masked pixels smoothly, as a membrane stretched from the rim of each hole.
@@ -225,8 +215,8 @@ class ThicknessMap(eqx.Module):
         Raises:
             ValueError: When fewer than 2 samples remain along an axis; under jit, where the new shape is unknown.
         """
-        columns = _kept("x", x, self.x)
-        rows = _kept("y", y, self.y)
+        columns = kept("x", x, self.x)
+        rows = kept("y", y, self.y)
 
         def cut(field: Array) -> Array:
             return field[rows, columns]
@@ -307,7 +297,7 @@ class ThicknessMap(eqx.Module):
             got = "neither" if shape is None else "both"
             raise ValueError(f"resampled needs either spacing=(dx, dy) [mm] or shape=(ny, nx), got {got}.")
         if shape is None:
-            sides, step = concrete(self.extent), concrete(_pair("spacing (dx, dy)", spacing))
+            sides, step = concrete(self.extent), concrete(pair("resampled.spacing (dx, dy)", spacing))
             if sides is None or step is None:
                 raise ValueError("resampled(spacing=) needs known numbers; under jit or vmap pass shape=(ny, nx).")
             check_positive("resampled.spacing (dx, dy)", "mm", step)
@@ -327,26 +317,3 @@ class ThicknessMap(eqx.Module):
 def _root(square: Scalar) -> Scalar:
     # The double where keeps the derivative finite at zero, where the root has none.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
-def _pair(field: str, value: Any) -> Pair:
-    pair = as_leaf(value, f"ThicknessMap.{field}", "mm")
-    if pair.shape not in ((), (2,)):
-        raise ValueError(f"ThicknessMap.{field} [mm] must be two numbers, got shape {pair.shape}.")
-    return jnp.broadcast_to(pair, (2,))
-
-
-def _kept(axis: str, bounds: tuple[float, float] | None, positions: Float[Array, " n"]) -> slice:
-    if bounds is None:
-        return slice(None)
-    known, first, last = concrete(positions), concrete(bounds[0]), concrete(bounds[1])
-    if known is None or first is None or last is None:
-        raise ValueError("cropped needs known positions; crop before jit, grad or vmap.")
-    margin = 1e-6 * (known[1] - known[0])
-    inside = np.flatnonzero((known >= first - margin) & (known <= last + margin))
-    if inside.size < 2:
-        raise ValueError(
-            f"cropped.{axis} [mm] must keep at least 2 samples of {known[0]:g} to {known[-1]:g} mm, "
-            f"got ({float(first):g}, {float(last):g}), which keeps {inside.size}."
-        )
-    return slice(int(inside[0]), int(inside[-1]) + 1)

@@ -11,12 +11,15 @@ from .maps import (
     plot_thickness,
     plot_uncertainty,
 )
+from .oct import draw_interface, plot_interface
 from .scene import plot_layer
 
 __all__ = [
     "draw_fit",
+    "draw_interface",
     "draw_pictures",
     "plot_fit",
+    "plot_interface",
     "plot_layer",
     "plot_pressure",
     "plot_report",

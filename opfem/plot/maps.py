@@ -105,7 +105,7 @@ def plot_thickness(
         cmap: Name of the colour map.
     """
     values = np.where(thickness.mask, np.nan, _UM * np.asarray(thickness.values))
-    return _image(values, np.asarray(thickness.x), np.asarray(thickness.y), ax, label, cmap, None)
+    return draw_image(values, np.asarray(thickness.x), np.asarray(thickness.y), ax, label, cmap, None)
 
 
 def plot_residual(
@@ -131,7 +131,7 @@ def plot_residual(
     limit = max(float(np.percentile(known, 99.5)), 1e-3) if known.size else 1.0
     x, y = dataset["x_image"].values, dataset["y_image"].values
     label = "Measured − computed thickness [µm]"
-    return _image(residual, x, y, ax, label, cmap, (-limit, limit))
+    return draw_image(residual, x, y, ax, label, cmap, (-limit, limit))
 
 
 def plot_report(
@@ -151,10 +151,10 @@ def plot_report(
         ValueError: For a failed solution, or a map on another grid.
     """
     dataset = _converged(data)
-    axes = (_shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
+    axes = (shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
     x, y = dataset["x_image"].values, dataset["y_image"].values
     measured_um = _UM * _measured_values(dataset, measured)
-    _image(measured_um, x, y, axes[0, 0], "Thickness [µm]", "viridis", None)
+    draw_image(measured_um, x, y, axes[0, 0], "Thickness [µm]", "viridis", None)
     plot_pressure(dataset, axes[0, 1])
     plot_status(dataset, axes[1, 0])
     plot_residual(dataset, measured, axes[1, 1])
@@ -213,16 +213,16 @@ def plot_fit(
         ValueError: For a failed fit.
     """
     dataset = _converged(data)
-    axes = (_shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
+    axes = (shown_figure(_REPORT_SIZE) if figure is None else figure).subplots(2, 2)
     plot_pressure(dataset, axes[0, 0])
     plot_uncertainty(dataset, axes[0, 1])
     x, y, residual = dataset["x"].values, dataset["y"].values, _UM * dataset["residual"].values
     limit = max(float(np.percentile(np.abs(residual), 99.5)), 1e-3)
-    _image(residual, x, y, axes[1, 0], "Interface − measured surface [µm]", "cividis", (-limit, limit))
+    draw_image(residual, x, y, axes[1, 0], "Interface − measured surface [µm]", "cividis", (-limit, limit))
     if measured is None:
         computed = _UM * dataset["thickness"].values
         x, y = dataset["x_image"].values, dataset["y_image"].values
-        _image(computed, x, y, axes[1, 1], "Thickness [µm]", "viridis", None)
+        draw_image(computed, x, y, axes[1, 1], "Thickness [µm]", "viridis", None)
     else:
         plot_thickness(measured, axes[1, 1])
     width = _UM * np.median(dataset["resolution_width"].values)
@@ -282,7 +282,7 @@ def _measured_values(dataset: xr.Dataset, measured: ThicknessMap | None) -> Floa
     return np.where(measured.mask, np.nan, measured.values)
 
 
-def _image(
+def draw_image(
     values: Float[np.ndarray, "my mx"],
     x: Float[np.ndarray, " mx"],
     y: Float[np.ndarray, " my"],
@@ -307,7 +307,7 @@ def _image(
     return ax
 
 
-def _shown_figure(size: tuple[float, float]) -> Figure:
+def shown_figure(size: tuple[float, float]) -> Figure:
     """Make a figure that notebooks show by themselves."""
     # Loaded here, so that writing a file never starts a display.
     import matplotlib.pyplot as plt
@@ -316,7 +316,7 @@ def _shown_figure(size: tuple[float, float]) -> Figure:
 
 
 def _axes(ax: Axes | None) -> Axes:
-    return _shown_figure(_MAP_SIZE).subplots() if ax is None else ax
+    return shown_figure(_MAP_SIZE).subplots() if ax is None else ax
 
 
 def _colour_bar(ax: Axes, colours: ScalarMappable, label: str, extend: str) -> Colorbar:

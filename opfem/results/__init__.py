@@ -4,6 +4,17 @@ from ..inverse import TractionFit
 from ..solvers import Solution
 from .dataset import to_xarray
 from .interior import LayerFields, layer_fields
+from .oct_scene import OctScene, oct_scene
 from .summary import summary, summary_rows
 
-__all__ = ["LayerFields", "Solution", "TractionFit", "layer_fields", "summary", "summary_rows", "to_xarray"]
+__all__ = [
+    "LayerFields",
+    "OctScene",
+    "Solution",
+    "TractionFit",
+    "layer_fields",
+    "oct_scene",
+    "summary",
+    "summary_rows",
+    "to_xarray",
+]

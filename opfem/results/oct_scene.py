@@ -1,0 +1,86 @@
+"""What an OCT microscope would see of a solved layer: its deformed surface, and how its points move between two states.
+
+`simulate_oct` makes volumes of it whose truth is the solution.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from ..measurement import ThicknessMap
+from ..solvers import Solution
+
+_ITERATIONS = 30  # of the inverse map; each gains a digit at strains of 30 %
+_CLOSE = 1e-9  # mm
+
+
+class OctScene(eqx.Module):
+    """A scene for `simulate_oct(system, scene.surface, increment=scene.increment, ...)`.
+
+    Attributes:
+        surface: Depth of the interface between layer and sample [mm].
+        increment: Displacement (u_x, u_y, u_z) [mm] from the first state to the second at points (x, y, z) [mm] of the
+            first; None for one state. Below the interface the sample moves as its surface.
+    """
+
+    surface: ThicknessMap
+    increment: Callable[[Any, Any, Any], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = eqx.field(static=True)
+
+
+def oct_scene(solution: Solution, before: Solution | None = None) -> OctScene:
+    """Make a scene of a solution, or of the increment between two of them.
+
+    Args:
+        solution: A solved state.
+        before: An earlier state of the same mesh; the scene is then of it, and its increment leads to `solution`.
+
+    Raises:
+        ValueError: For states of two meshes.
+    """
+    first = solution if before is None else before
+    surface = first.thickness
+    if np.any(surface.mask) and not surface.is_filled:
+        surface = surface.filled()
+    if before is None:
+        return OctScene(surface, None)
+    if before.displacement.shape != solution.displacement.shape:
+        raise ValueError(
+            f"oct_scene needs two states of one mesh, got displacements of shape {before.displacement.shape} and "
+            f"{solution.displacement.shape}."
+        )
+    start = np.asarray(before.displacement)
+    step = np.asarray(solution.displacement) - start
+    positions = np.asarray(before.positions)
+
+    def increment(x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        points = np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in (x, y, z))))
+        moved = _at(step, _reference(points, positions, start), positions)
+        return moved[0], moved[1], moved[2]
+
+    return OctScene(surface, increment)
+
+
+def _reference(points: np.ndarray, positions: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Find the reference points X that now lie at `points`: X = x - u(X), by fixed-point iteration."""
+    reference = points
+    for _ in range(_ITERATIONS):
+        closer = points - _at(displacement, reference, positions)
+        change = float(np.max(np.abs(closer - reference)))
+        reference = closer
+        if change < _CLOSE:
+            break
+    return reference
+
+
+def _at(field: np.ndarray, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Interpolate a nodal field trilinearly at reference points; outside the layer its edge value holds."""
+    _, nz, ny, nx = (count - 1 for count in positions.shape)
+    x, y, z = points
+    i = nx * (x - positions[0, 0, 0, 0]) / (positions[0, 0, 0, -1] - positions[0, 0, 0, 0])
+    j = ny * (y - positions[1, 0, 0, 0]) / (positions[1, 0, -1, 0] - positions[1, 0, 0, 0])
+    thickness = map_coordinates(positions[2, -1], [j, i], order=1, mode="nearest")
+    k = nz * z / thickness
+    return np.stack([map_coordinates(part, [k, j, i], order=1, mode="nearest") for part in field])

@@ -1,0 +1,313 @@
+"""OCT volumes come back from every kind of file as they were, and what is wrong with a file is said in one line."""
+
+import re
+import shutil
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import tifffile
+
+import opfem as op
+from tests.tolerances import ROUNDOFF
+
+SHAPE = (5, 7, 11)  # differs on each axis
+
+
+def samples(dtype=np.float32):
+    rng = np.random.default_rng(3)
+    values = 40.0 + 10.0 * rng.standard_normal(SHAPE)
+    return (
+        (values + 1j * rng.standard_normal(SHAPE)).astype(dtype)
+        if np.dtype(dtype).kind == "c"
+        else values.astype(dtype)
+    )
+
+
+def volume(scale="db", **more):
+    return op.OctVolume(
+        samples(np.complex64 if scale == "complex" else np.float32), (0.01, 0.02), 2.5e-3, scale,
+        origin=(0.1, 0.2), depth_origin=0.03, wavelength=845e-6, **more,
+    )  # fmt: skip
+
+
+def same(read, written):
+    np.testing.assert_array_equal(read.values, written.values)
+    assert read.scale == written.scale
+    assert read.phase_sign == written.phase_sign
+    for name in ("spacing", "origin", "optical_spacing", "depth_origin", "wavelength"):
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=ROUNDOFF)
+
+
+def rewritten(source, target, compression=zipfile.ZIP_STORED, slash="\\", header=lambda text: text, leave_out=()):
+    """Write the entries of a ZIP file again, in another way."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
+        for info in old.infolist():
+            content = old.read(info)
+            if info.filename == "Header.xml":
+                content = header(content.decode()).encode()
+            if info.filename not in leave_out:
+                new.writestr(zipfile.ZipInfo(info.filename.replace("\\", slash)), content, compression)
+    return target
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".oct"])
+@pytest.mark.parametrize("scale", ["db", "complex"])
+def test_written_volume_comes_back(tmp_path, suffix, scale):
+    written = volume(scale, phase_sign=-1 if scale == "complex" else None)
+    op.write_oct(written, tmp_path / f"a{suffix}")
+    read = op.read_oct(tmp_path / f"a{suffix}")
+    same(read, written)
+    assert isinstance(read.values, np.memmap)  # read in place
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize("slash", ["\\", "/"])
+@pytest.mark.parametrize("index", [1.0, 1.4])
+def test_thorlabs_file(tmp_path, compression, slash, index):
+    written = volume()
+    op.write_oct(written, tmp_path / "a.oct")
+    text = f"<RefractiveIndex>{index:f}</RefractiveIndex>"
+    path = rewritten(
+        tmp_path / "a.oct", tmp_path / "b.oct", compression, slash,
+        lambda header: header.replace("<RefractiveIndex>1.000000</RefractiveIndex>", text),
+    )  # fmt: skip
+    read = op.read_oct(path)
+    np.testing.assert_array_equal(read.values, written.values)
+    # ThorImage divides depth by its index.
+    np.testing.assert_allclose(read.optical_spacing, index * 2.5e-3, rtol=ROUNDOFF)
+    np.testing.assert_allclose(op.read_oct(path, index_applied=1.0).optical_spacing, 2.5e-3, rtol=ROUNDOFF)
+
+
+def test_thorlabs_folder(tmp_path):
+    written = volume()
+    op.write_oct(written, tmp_path / "a.oct")
+    folder = tmp_path / "unpacked"
+    (folder / "data").mkdir(parents=True)
+    with zipfile.ZipFile(tmp_path / "a.oct") as archive:
+        for info in archive.infolist():
+            (folder / info.filename.replace("\\", "/")).write_bytes(archive.read(info))
+    same(op.read_oct(folder), written)
+    # Programs that do not know the backslash make it part of the name.
+    shutil.move(folder / "data" / "Intensity.data", folder / "data\\Intensity.data")
+    same(op.read_oct(folder), written)
+
+
+def test_two_dimensional_thorlabs_file(tmp_path):
+    op.write_oct(volume(), tmp_path / "a.oct")
+
+    def flat(header):
+        header = re.sub(r'SizeX="7" SizeY="5"', 'SizeX="35"', header)
+        return re.sub(r' RangeY="[^"]*"', "", header)
+
+    read = op.read_oct(rewritten(tmp_path / "a.oct", tmp_path / "b.oct", header=flat))
+    np.testing.assert_array_equal(read.values, samples().reshape(1, 35, 11))
+
+
+def test_two_cameras(tmp_path):
+    written = volume("complex")
+    op.write_oct(written, tmp_path / "a.oct")
+
+    def twice(header):
+        (found,) = re.findall(r"<DataFile .*?</DataFile>", header)
+        return header.replace(found, found.replace("Complex.data", "Complex_Cam0.data") + found)
+
+    path = rewritten(tmp_path / "a.oct", tmp_path / "b.oct", header=twice)
+    with pytest.raises(op.MeasurementError, match="several: Complex_Cam0, Complex; pass variable="):
+        op.read_oct(path)
+    np.testing.assert_array_equal(op.read_oct(path, variable="Complex").values, written.values)
+
+
+@pytest.mark.parametrize("order", ["zxy", "xzy", "yxz"])
+def test_orders_of_stored_axes(tmp_path, order):
+    """Raw numbers, .npy, HDF5 and .mat of one volume, its axes stored in one order, are equal."""
+    values = samples()
+    stored = np.ascontiguousarray(values.transpose(["yxz".index(axis) for axis in order[::-1]]))
+    stored.tofile(tmp_path / "a.raw")
+    np.save(tmp_path / "a.npy", stored)
+    np.save(tmp_path / "b.npy", np.asfortranarray(stored.T))
+    scipy.io.savemat(tmp_path / "a.mat", {"volume": stored.T, "other": np.eye(3)})
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["volume"] = stored
+        file["chunked"] = np.zeros(3)
+    tifffile.imwrite(tmp_path / "a.tif", stored)
+    stated = {"spacing": (0.01, 0.02), "depth_spacing": 2.5e-3, "scale": "db", "order": order}
+    for name in ("a.npy", "b.npy", "a.mat", "a.h5", "a.tif"):
+        read = op.read_oct(tmp_path / name, **stated)
+        np.testing.assert_array_equal(read.values, values, err_msg=name)
+    np.testing.assert_array_equal(op.read_oct(tmp_path / "a.raw", shape=SHAPE, **stated).values, values)
+
+
+def test_complex_numbers_as_matlab_stores_them(tmp_path):
+    values = samples(np.complex64)
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        compound = values.view([("real", "<f4"), ("imag", "<f4")])
+        file.create_dataset("c", data=compound, chunks=(1, 7, 11), compression="gzip")
+    read = op.read_oct(
+        tmp_path / "a.mat", spacing=0.01, depth_spacing=2.5e-3, scale="complex", order="zxy", phase_sign=1
+    )
+    np.testing.assert_array_equal(read.values, values)
+    assert read.phase_sign == 1
+
+
+def test_what_is_not_stated_is_asked_for(tmp_path):
+    np.save(tmp_path / "a.npy", samples())
+    stated = {"order": "zxy", "scale": "db", "spacing": 0.01, "depth_spacing": 2.5e-3}
+    asked = {
+        "order": r"needs order=, the axes of the array of shape \(5, 7, 11\)",
+        "scale": "values span 10.* looks like dB",
+        "spacing": r"needs spacing=\(dx, dy\) \[mm\]",
+        "depth_spacing": r"needs depth_spacing= \[mm\], as in air",
+    }
+    for name, message in asked.items():
+        rest = {key: value for key, value in stated.items() if key != name}
+        with pytest.raises(op.MeasurementError, match=message):
+            op.read_oct(tmp_path / "a.npy", **rest)
+    with pytest.raises(op.MeasurementError, match="is it in µm"):
+        op.read_oct(tmp_path / "a.npy", **{**stated, "spacing": 10.0})
+    samples().tofile(tmp_path / "a.raw")
+    with pytest.raises(op.MeasurementError, match=r"float32 takes 1120 bytes, the file has 1540"):
+        op.read_oct(tmp_path / "a.raw", shape=(5, 7, 8), **stated)
+
+
+def test_what_is_wrong_with_a_thorlabs_file(tmp_path):
+    path = tmp_path / "a.oct"
+    op.write_oct(volume(), path)
+
+    def refused(message, **change):
+        with pytest.raises(op.MeasurementError, match=message) as caught:
+            op.read_oct(rewritten(path, tmp_path / "b.oct", **change))
+        assert "\n" not in str(caught.value)
+
+    refused("Intensity.data is missing; the ZIP file holds Header.xml", leave_out=("data\\Intensity.data",))
+    refused("11 × 7 × 6 numbers of 4 bytes, 1848 bytes, got 1540", header=lambda h: h.replace('SizeY="5"', 'SizeY="6"'))
+    refused("SizeZ must be a positive whole number, got '-3'", header=lambda h: h.replace('SizeZ="11"', 'SizeZ="-3"'))
+    refused("states no RangeX", header=lambda h: re.sub('RangeX="[^"]*"', "", h))
+    refused("repeated B-scans", header=lambda h: re.sub('RangeY="[^"]*"', 'RangeY="0"', h))
+    refused(
+        "holds no complex or intensity or spectra; it holds Other",
+        header=lambda h: h.replace("Intensity.data", "Other.data"),
+    )
+    refused("is not XML", header=lambda h: h[:200])
+    bomb = '<!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]>'
+    refused("declares a document type", header=lambda h: h.replace("<Ocity", bomb + "<Ocity", 1))
+    deep = "<a>" * 5000 + "</a>" * 5000
+    refused("elements", header=lambda h: h.replace("</Ocity>", deep + "</Ocity>"))
+
+
+def test_cut_off_file(tmp_path):
+    op.write_oct(volume(), tmp_path / "a.oct")
+    whole = (tmp_path / "a.oct").read_bytes()
+    for size in (10, 500, len(whole) - 40):
+        (tmp_path / "b.oct").write_bytes(whole[:size])
+        with pytest.raises(op.MeasurementError, match=r"b\.oct: "):
+            op.read_oct(tmp_path / "b.oct")
+
+
+def test_claims_beyond_memory_are_refused(tmp_path):
+    """An entry that says it unpacks to terabytes is never unpacked."""
+    op.write_oct(volume(), tmp_path / "a.oct")
+    path = rewritten(tmp_path / "a.oct", tmp_path / "b.oct", zipfile.ZIP_DEFLATED)
+    with zipfile.ZipFile(path) as archive:
+        size = archive.getinfo("data\\Intensity.data").file_size.to_bytes(4, "little")
+    path.write_bytes(path.read_bytes().replace(size, (2**31 - 8).to_bytes(4, "little")))
+    huge = r'SizeZ="11" SizeX="7" SizeY="5"', 'SizeZ="4194302" SizeX="128" SizeY="1"'
+    with pytest.raises(op.MeasurementError):
+        op.read_oct(rewritten_header(path, tmp_path / "c.oct", *huge))
+
+
+def rewritten_header(source, target, old, new):
+    with zipfile.ZipFile(source) as archive:
+        header = archive.read("Header.xml")
+    content = source.read_bytes()
+    assert old.encode() in header
+    target.write_bytes(content)
+    with zipfile.ZipFile(target, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("Header.xml", header.decode().replace(old, new))
+    return target
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.oct", b"", "empty"),
+        ("a.oct", b"\x00" * 900, "not Thorlabs' .oct, which is a ZIP file"),
+        ("a.OCT", b"\x01\x02\x0b\x00\x00\x00FRAMEHEADER" + b"\0" * 900, "Bioptigen's"),
+        ("a.dcm", b"\0" * 128 + b"DICM" + b"\0" * 900, "is DICOM"),
+        ("a.IMG", b"\x01" * 900, "swept-source .IMG"),
+    ],
+)
+def test_other_formats_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(op.MeasurementError, match=message):
+        op.read_oct(tmp_path / name)
+
+
+def test_pictures_and_empty_volumes_are_refused(tmp_path):
+    stated = {"spacing": 0.01, "depth_spacing": 2.5e-3, "scale": "linear"}
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((5, 11, 7, 3), np.uint8), photometric="rgb")
+    with pytest.raises(op.MeasurementError, match="colour-mapped picture"):
+        op.read_oct(tmp_path / "a.tif", **stated)
+    np.save(tmp_path / "a.npy", np.zeros(SHAPE, np.float32))
+    with pytest.raises(op.MeasurementError, match="all samples are 0"):
+        op.read_oct(tmp_path / "a.npy", order="zxy", **stated)
+    np.save(tmp_path / "a.npy", np.full(SHAPE, np.nan, np.float32))
+    with pytest.raises(op.MeasurementError, match="100% of the samples are NaN"):
+        op.read_oct(tmp_path / "a.npy", order="zxy", **stated)
+
+
+def test_write_refuses_another_suffix(tmp_path):
+    with pytest.raises(ValueError, match=r"writes \.h5 or \.oct"):
+        op.write_oct(volume(), tmp_path / "a.tif")
+
+
+def test_linear_power_is_written_as_decibels(tmp_path):
+    written = op.OctVolume(np.abs(samples()), 0.01, 2.5e-3, "linear")
+    op.write_oct(written, tmp_path / "a.oct")
+    read = op.read_oct(tmp_path / "a.oct")
+    np.testing.assert_allclose(read.intensity(), written.values, rtol=1e-5)  # float32 of 16 dB
+
+
+def test_raw_spectra_of_a_thorlabs_file(tmp_path):
+    """Mirrors in two B-scans of raw spectra, with apodisation lines, offset and chirp, come back at their depths."""
+    pixels, lines = 1024, 3
+    wavelength = np.linspace(830e-6, 930e-6, pixels)  # mm; short to long, as Thorlabs' spectrometers
+    k = 2 * np.pi / wavelength
+    chirp = (k[0] - k) / (k[0] - k[-1]) * (pixels - 1)
+    light = 2e4 * np.exp(-0.5 * ((wavelength - 880e-6) / 30e-6) ** 2)
+    offset = np.full(pixels, 90.0, "<f4")
+    depths = np.array([[0.2, 0.4], [0.6, 0.8]])  # mm, as in air
+    dark = np.broadcast_to(light, (2, lines, pixels))
+    fringes = light * (1 + 0.3 * np.cos(2 * k * depths[..., None]))
+    counts = np.concatenate([dark, fringes], axis=1) + offset
+    reach = np.pi / (k[0] - k[-1]) * (pixels - 1) / 2  # mm that the volume covers
+    part = '<DataFile Type="Raw" SizeZ="1024" SizeX="5" SizeY="1" RangeZ="{}" RangeX="0.02" RangeY="0.01" '
+    part += 'BytesPerPixel="2" ApoRegionStart0="0" ApoRegionEnd0="3" ScanRegionStart0="3" ScanRegionEnd0="5">'
+    part += "data\\Spectral{}.data</DataFile>"
+    vector = '<DataFile Type="Real" SizeZ="1024" BytesPerPixel="4">data\\{}.data</DataFile>'
+    files = "".join(part.format(float(reach), row) for row in range(2)) + vector.format("Chirp")
+    header = (
+        f"<Ocity><DataFiles>{files}{vector.format('OffsetErrors')}</DataFiles>"
+        "<Instrument><RawDataIsSigned>False</RawDataIsSigned><CentralWavelength>880</CentralWavelength></Instrument></Ocity>"
+    )
+    with zipfile.ZipFile(tmp_path / "a.oct", "w") as archive:
+        archive.writestr("Header.xml", header)
+        archive.writestr("data\\Chirp.data", chirp.astype("<f4").tobytes())
+        archive.writestr("data\\OffsetErrors.data", offset.tobytes())
+        for row in range(2):
+            archive.writestr(f"data\\Spectral{row}.data", np.round(counts[row]).astype("<u2").tobytes())
+    spectra = op.read_spectra(tmp_path / "a.oct", spacing=(0.01, 0.01))
+    assert spectra.shape == (2, 2, pixels)
+    np.testing.assert_allclose(spectra.reference, light, atol=0.6)
+    volume = op.read_oct(tmp_path / "a.oct", spacing=(0.01, 0.01))
+    assert volume.scale == "complex"
+    assert volume.phase_sign == -1
+    power = np.log(volume.intensity())
+    top = np.argmax(power[..., 8:-8], axis=2) + 8
+    low, mid, high = (np.take_along_axis(power, top[..., None] + step, axis=2)[..., 0] for step in (-1, 0, 1))
+    found = (top + 0.5 * (low - high) / (low - 2 * mid + high)) * float(volume.optical_spacing)
+    np.testing.assert_allclose(found, depths, atol=0.5e-3)
+    with pytest.raises(op.MeasurementError, match="holds no intensity; it holds Spectral0"):
+        op.read_oct(tmp_path / "a.oct", quantity="intensity")

@@ -1,0 +1,73 @@
+"""A mirror in raw spectra comes back at its depth, moves as it moved, and stays sharp under dispersion."""
+
+import numpy as np
+import pytest
+
+import opfem as op
+
+PIXELS = 2048
+K = (2 * np.pi / 930e-6, 2 * np.pi / 830e-6)  # rad/mm, at the ends of the spectrum
+
+
+def mirror(depths, ascending=True, dispersion=0.0, offset=100.0):
+    """Interferograms of a mirror at optical depths [mm], on a spectrometer whose pixels lie even in wavelength."""
+    places = np.linspace(0.0, 1.0, PIXELS)
+    wavelength = 2 * np.pi / K[1] + places * (2 * np.pi / K[0] - 2 * np.pi / K[1])  # short to long
+    k = 2 * np.pi / wavelength
+    if ascending:
+        k = k[::-1]
+    chirp = (k - k[0]) / (k[-1] - k[0]) * (PIXELS - 1)
+    reference = 3e4 * np.exp(-0.5 * ((k - np.mean(K)) / 150.0) ** 2)
+    span = 2 * chirp / (PIXELS - 1) - 1
+    turn = dispersion * span**2
+    counts = [reference * (1 + 0.2 * np.cos(2 * k * depth + turn)) + offset for depth in depths]
+    return op.Spectra(
+        np.array(counts, np.float32)[None], 0.01, np.pi / (K[1] - K[0]) * (PIXELS - 1) / PIXELS,
+        reference=reference, offset=offset, chirp=chirp, is_ascending=ascending,
+    )  # fmt: skip
+
+
+def places(volume):
+    """Depths [mm] of the brightest samples, by the parabola through the logarithm of the power."""
+    power = np.log(volume.intensity()[0])
+    top = np.argmax(power[:, 8:-8], axis=1) + 8
+    low, mid, high = (power[np.arange(top.size), top + step] for step in (-1, 0, 1))
+    return (top + 0.5 * (low - high) / (low - 2 * mid + high)) * float(volume.optical_spacing)
+
+
+@pytest.mark.parametrize("ascending", [True, False])
+def test_moving_mirror(ascending):
+    depths = np.array([0.2, 0.3, 0.3001, 0.9, 1.6])
+    volume = mirror(depths, ascending).to_volume()
+    np.testing.assert_allclose(places(volume), depths, atol=0.5e-3)
+    assert volume.phase_sign == (1 if ascending else -1)
+    # 0.1 µm between the second and the third, at the centroid of the shaped spectrum.
+    field = np.asarray(volume.values)[0]
+    top = np.argmax(np.abs(field[1]))
+    moved = volume.phase_sign * np.angle(field[2, top] * np.conj(field[1, top])) / (2 * np.mean(K))
+    assert moved == pytest.approx(1e-4, rel=5e-3)
+
+
+def test_dispersion_is_taken_out():
+    sharp, blurred = mirror([0.5]).to_volume(), mirror([0.5], dispersion=30.0)
+    assert blurred.to_volume().intensity().max() < 0.3 * sharp.intensity().max()
+    mended = blurred.to_volume(dispersion=(30.0, 0.0))
+    assert mended.intensity().max() == pytest.approx(sharp.intensity().max(), rel=1e-3)
+    np.testing.assert_allclose(places(mended), 0.5, atol=0.5e-3)
+
+
+def test_reference_is_the_mean_where_none_is_given():
+    rng = np.random.default_rng(0)
+    spectra = mirror(rng.uniform(0.3, 1.2, 200))
+    plain = op.Spectra(
+        spectra.values, 0.01, spectra.optical_spacing, offset=100.0, chirp=spectra.chirp, is_ascending=True
+    )
+    np.testing.assert_allclose(places(plain.to_volume())[:20], places(spectra.to_volume())[:20], atol=0.5e-3)
+
+
+def test_bad_spectra_are_refused():
+    good = mirror([0.3])
+    with pytest.raises(ValueError, match="chirp must grow"):
+        op.Spectra(good.values, 0.01, 2e-3, chirp=np.arange(PIXELS)[::-1])
+    with pytest.raises(ValueError, match="one number a pixel, 2048, got shape"):
+        op.Spectra(good.values, 0.01, 2e-3, reference=np.ones(5))
