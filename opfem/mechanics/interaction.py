@@ -122,7 +122,7 @@ class ContactFace(eqx.Module):
     @property
     def is_exact(self) -> bool:
         """Whether the pressure is to be reached without penetration."""
-        return self.contact.law.exact and self.imposed is None
+        return self.own_contact.law.exact and self.imposed is None
 
     def _carried(self, history: SlipHistory) -> Array | float:
         """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""

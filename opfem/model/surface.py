@@ -75,7 +75,7 @@ class HeightField(eqx.Module):
         powers = jnp.stack([jnp.ones_like(t), t, t * t, t * t * t])
         basis = [_CUBICS[self.interpolation]]
         for _ in range(order):
-            basis.append(np.pad(basis[-1][:, 1:] * np.arange(1, 4), ((0, 0), (0, 1))))
+            basis.append(np.pad(basis[-1][:, 1:] * np.arange(1, 4), np.array([(0, 0), (0, 1)])))
         weights = jnp.tensordot(jnp.asarray(np.stack(basis), t.dtype), powers, 1)
         per_length = 1.0 / self.spacing[axis]
         scales = jnp.stack([per_length**k for k in range(order + 1)]).reshape(order + 1, *[1] * (t.ndim + 1))

@@ -247,8 +247,8 @@ def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
 def _coarsen_mask(free: np.ndarray) -> np.ndarray:
     for axis in _coarsened_axes(free.shape):
         if free.shape[axis] % 2 == 0:  # odd count of elements: the ghost node is free
-            widths = [(0, 0)] * free.ndim
-            widths[axis] = (0, 1)
+            widths = np.zeros((free.ndim, 2), int)
+            widths[axis, 1] = 1
             free = np.pad(free, widths, constant_values=1)
         free = free[..., ::2] if axis == -1 else free[..., ::2, :]
     return free

@@ -157,7 +157,7 @@ def neighbours(values: Float[Array, "c mz my mx"]) -> Float[Array, "3 9 c mz my 
 def mask_stencil(free: np.ndarray) -> np.ndarray:
     """Mark the entries of a stencil whose two unknowns are both free: `(3, 9, 3, 3, mz, my, mx)`."""
     mz, my, mx = free.shape[1:]
-    padded = np.pad(free, [(0, 0), (1, 1), (1, 1), (1, 1)])
+    padded = np.pad(free, np.array([(0, 0), (1, 1), (1, 1), (1, 1)]))
     offsets = itertools.product(range(3), repeat=3)
     around = np.stack([padded[:, z : z + mz, y : y + my, x : x + mx] for z, y, x in offsets])
     return around.reshape(3, 9, 1, *free.shape) * free[:, None]
