@@ -40,20 +40,31 @@ _REPLACEMENT = ".opfem-replacement"
 
 
 class _Axis(NamedTuple):
-    """A number of the experiment that may vary."""
+    """A number of the experiment that may vary; what its law or contact allows beside, is found where it is stated."""
 
     unit: str
     where: Callable[[Palpation], Any]
-    may_be_zero: bool = False
+    least: float = 0.0
+    least_too: bool = False
+
+    @property
+    def expected(self) -> str:
+        """What its values must be."""
+        return "finite" if self.least < 0.0 else "zero or positive" if self.least_too else "positive"
+
+    def takes(self, values: np.ndarray) -> bool:
+        """Tell whether all values are such."""
+        enough = values >= self.least if self.least_too else values > self.least
+        return bool(np.all(np.isfinite(values) & enough))
 
 
 _AXES = {
-    "c10": _Axis("MPa", lambda p: p.layer.material.c10),
-    "c01": _Axis("MPa", lambda p: p.layer.material.c01, True),
+    "c10": _Axis("MPa", lambda p: p.layer.material.c10, -np.inf),
+    "c01": _Axis("MPa", lambda p: p.layer.material.c01, -np.inf),
     "bulk": _Axis("MPa", lambda p: p.layer.material.bulk),
     "l0": _Axis("mm", lambda p: p.layer.thickness),
-    "window_friction": _Axis("1", lambda p: p.window.friction, True),
-    "sample_friction": _Axis("1", lambda p: p.sample.friction, True),
+    "window_friction": _Axis("1", lambda p: p.window.friction, least_too=True),
+    "sample_friction": _Axis("1", lambda p: p.sample.friction, least_too=True),
     "p0": _Axis("MPa", lambda p: p.sample.law.pressure),
     "c0": _Axis("mm", lambda p: p.sample.law.clearance),
 }
@@ -243,10 +254,9 @@ def _factor(name: str, axis: Any) -> float:
 
 
 def _checked(name: str, values: np.ndarray) -> np.ndarray:
-    unit, zero = _AXES[name].unit, _AXES[name].may_be_zero
-    if values.size and not (np.isfinite(values).all() and (values.min() >= 0 if zero else values.min() > 0)):
-        wanted = "zero or positive" if zero else "positive"
-        raise ValueError(f"[axes] {name} [{unit}] must be {wanted}, got {values.tolist()}.")
+    axis = _AXES[name]
+    if not axis.takes(values):
+        raise ValueError(f"[axes] {name} [{axis.unit}] must be {axis.expected}, got {values.tolist()}.")
     return values
 
 

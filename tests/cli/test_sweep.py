@@ -108,11 +108,11 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys):
         ('unit = "kPa"', 'unit = ["kPa"]', "[axes] c10 unit must be one of MPa, kPa, Pa, got ['kPa']"),
         ("[0.0, 0.2]", "[0.0, true]", "[axes] window_friction [1] must be a number, got True"),
         ("[0.0, 0.2]", "[0.0, nan]", "[axes] window_friction [1] must be zero or positive, got [0.0, nan]"),
-        ("to = 4.0", "to = 1e999", "[axes] c10 [MPa] must be positive, got [2.0, inf]"),
+        ("to = 4.0", "to = 1e999", "[axes] c10 [MPa] must be finite, got [2.0, inf]"),
         (
             "to = 4.0, points = 2",
             "to = nan, points = 2, log = true",
-            "[axes] c10 [MPa] must be positive, got [2.0, nan]",
+            "[axes] c10 [MPa] must be finite, got [2.0, nan]",
         ),
         ("[0.0, 0.2]", "{ values = 0.2 }", "[axes] window_friction must hold a list of numbers, got 0.2"),
         ("smooth = 0.2", 'smooth = "0.2"', "[inputs] smooth must be a number, got '0.2'"),
