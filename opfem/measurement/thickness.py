@@ -89,7 +89,7 @@ class ThicknessMap(AbstractGrid):
         """Make a map from an array and its grid.
 
         Args:
-            values: Thickness [mm], shape (ny, nx).
+            values: Thickness [mm], shape (ny, nx); of a NumPy masked array, masked pixels are no data.
             extent: (Lx, Ly) from the first to the last sample [mm]; this or `spacing`.
             spacing: (dx, dy) between samples [mm], or one number for both; this or `extent`.
             origin: (x, y) of `values[0, 0]` [mm].
@@ -103,6 +103,10 @@ class ThicknessMap(AbstractGrid):
             ValueError: For a wrong shape; NaN, infinite, or unmasked non-positive thickness; a range that
                 suggests another unit; both or neither of `extent` and `spacing`.
         """
+        if isinstance(values, np.ma.MaskedArray):
+            masked = np.ma.getmaskarray(values)
+            mask = masked if mask is None else jnp.asarray(mask) | masked
+            values = values.filled(1.0)  # whatever they hold, NaN too, counts nowhere
         self.values = as_leaf(values, "ThicknessMap.values", "mm")
         check_map_shape(self.values)
         shape, dtype = self.values.shape, self.values.dtype

@@ -59,6 +59,13 @@ class TestConstructor:
     def test_integers_become_floats(self):
         assert ThicknessMap(np.full((3, 4), 2), extent=(1, 1)).values.dtype == jnp.float64
 
+    def test_masked_pixels_of_a_masked_array_are_no_data(self):
+        values = np.full((3, 4), 0.4)
+        values[1, 2], values[0, 0] = np.nan, 9999.0
+        thickness = ThicknessMap(np.ma.masked_array(values, ~(values < 1.0)), extent=(3.0, 2.0), mask=values > 1.0)
+        np.testing.assert_array_equal(thickness.mask, ~(values < 1.0))
+        assert float(thickness.filled().values.max()) == pytest.approx(0.4)
+
     def test_masked_pixel_may_hold_any_finite_number(self):
         values = field()
         values[hole()] = -7.0
