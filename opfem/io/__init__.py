@@ -1,7 +1,7 @@
 """Files in and out: the only part of the package that touches a disk."""
 
 from ..measurement import MeasurementError
-from .atomic import finish, take_place, whole_file, write_together
+from .atomic import finish, take_place, whole_file, write_together, write_whole
 from .checkpoint import Checkpoint as Checkpoint
 from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
 from .oct import read_oct, read_spectra, write_oct
@@ -26,4 +26,5 @@ __all__ = [
     "write_thickness",
     "write_together",
     "write_vtu",
+    "write_whole",
 ]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..io import whole_file
+from ..io import whole_file, write_whole
 from .outputs import GOOD, Label
 from .plan import Plan
 
@@ -111,8 +111,7 @@ class Folder:
         """Write down what is swept, and how."""
         self._points.mkdir(parents=True, exist_ok=True)
         record = {"inputs": self._inputs, "execution": dataclasses.asdict(plan)}
-        with whole_file(self._folder / PLAN) as temporary:
-            temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        write_whole(self._folder / PLAN, (json.dumps(record, indent=2) + "\n").encode())
 
     def has(self, point: int) -> bool:
         """Tell whether a point is finished, by this process or another; a damaged file counts for nothing."""
