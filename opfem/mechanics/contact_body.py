@@ -1,6 +1,7 @@
 """What a contact face meets: a rigid surface that moves with the load, or a pressure that is imposed."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -42,6 +43,24 @@ class RigidSurface(eqx.Module):
         if self.start is None or self.end is None:
             return None
         return RigidPatches(self.start.around(x, y), self.end.around(x, y))
+
+
+class RigidPlate(eqx.Module):
+    """A rigid plane across z that moves along z from `start` to `end` [mm]."""
+
+    start: Array
+    end: Array
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether it is a plane."""
+        return True
+
+    def derivatives(self, fraction: Array, x: Array, y: Array, order: int) -> Float[Array, "along_y along_x *points"]:
+        """Evaluate height [mm] and its derivatives, which are zero."""
+        height = (1.0 - fraction) * self.start + fraction * self.end
+        others = jnp.zeros((order + 1, order + 1, *x.shape), x.dtype)
+        return jax.lax.dynamic_update_slice(others, jnp.broadcast_to(height, (1, 1, *x.shape)), (0,) * others.ndim)
 
 
 class RigidPatches(eqx.Module):

@@ -22,7 +22,7 @@ class SlipHistory(eqx.Module):
     """What friction remembers at the end of an increment, per face point.
 
     Attributes:
-        position: (x, y) of the points `(2, points, *faces)` [mm].
+        position: (x, y) of the points `(2, points, *faces)` [mm]; on a deformable body, its material points [cells].
         elastic: Elastic part of the slip `(2, points, *faces)` [mm].
         slip: Slip slid so far, along x and y `(2, points, *faces)` [mm].
         dissipated: Work done by friction so far on the whole face [N mm]; of each body where faces are paired.
@@ -106,6 +106,8 @@ class FacePoints(NamedTuple):
         height: Of the surface [mm].
         slope: Of the surface along x and y `(2, points, *faces)` [-].
         bend: Second derivatives of the surface `(2, 2, points, *faces)` [1/mm]; None where only forces are asked for.
+        anchor: x and y [mm] of the surface's material point that each point met at the last increment; None on a rigid
+            surface, which has none.
     """
 
     fraction: Array
@@ -114,6 +116,7 @@ class FacePoints(NamedTuple):
     height: Float[Array, "points *faces"]
     slope: Float[Array, "2 points *faces"]
     bend: Float[Array, "2 2 points *faces"] | None
+    anchor: Float[Array, "2 points *faces"] | None = None
 
     @property
     def stretch(self) -> Float[Array, "points *faces"]:

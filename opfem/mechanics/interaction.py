@@ -93,9 +93,9 @@ class ContactFace(eqx.Module):
 
     def at_points(self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None) -> PointContact:
         """Evaluate contact at face points, with the contact's own law or a linearised one."""
-        clearance = self._clearance(points)
-        pressure, push, _, _ = self._pressure(points, clearance, law or self._law(history))
-        friction = self._friction(pressure, points, history, None if law is None else law.sticks)
+        clearance = self.clearance(points)
+        pressure, push, _, _ = self._pressure(points, clearance, law or self.own_law(history))
+        friction = self.friction(pressure, points, history, None if law is None else law.sticks)
         return PointContact(
             friction.traction - self._side(push) * push * points.normal,
             pressure,
@@ -112,7 +112,8 @@ class ContactFace(eqx.Module):
         side = np.where(self.above, 1.0, -1.0)
         return np.repeat(side, points.shape[-1] // side.size) if side.ndim else side
 
-    def _clearance(self, points: FacePoints) -> Float[Array, "points *faces"]:
+    def clearance(self, points: FacePoints) -> Float[Array, "points *faces"]:
+        """Compute the gap along the surface's normal [mm]."""
         towards = (points.height - points.position[2]) * self._side(points.height)
         offset = (
             jnp.repeat(self.offset, points.height.shape[-1] // self.offset.size) if self.offset.ndim else self.offset
@@ -128,7 +129,8 @@ class ContactFace(eqx.Module):
         """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""
         return 0.0 if self.imposed is not None else self.contact.law.carried(history.pressure, self.stiffness)
 
-    def _law(self, history: SlipHistory) -> Callable[[Array], Array]:
+    def own_law(self, history: SlipHistory) -> Callable[[Array], Array]:
+        """Take the contact's pressure as a function of clearance [mm], shifted where it is exact."""
         carried = self._carried(history)
         return lambda clearance: self.contact.law.pressure_at(clearance + carried, self.stiffness)
 
@@ -166,9 +168,9 @@ class ContactFace(eqx.Module):
         the pressure that shortens an element by a thousandth.
         """
         sticks = jnp.sum(_trial(points, history) * iterate.direction, axis=0) < 0
-        clearance = self._clearance(points)
+        clearance = self.clearance(points)
         most = 1e-3 * self.stiffness * self.element_size
-        law = self._law(history)
+        law = self.own_law(history)
         pressure = jnp.maximum(iterate.pressure, jnp.minimum(law(clearance), most))
         at = self.contact.law.clearance_at(pressure, self.stiffness) - self._carried(history)
         slope = jax.jvp(law, (at,), (jnp.ones_like(at),))[1]
@@ -183,7 +185,7 @@ class ContactFace(eqx.Module):
         The pressure follows the clearance's linear change.
         """
         step = jnp.moveaxis(contract(quadrature(self.rule).N, change), 1, 0)
-        clearance = self._clearance(points)
+        clearance = self.clearance(points)
         further = jnp.sum(self._clearance_slope(points, clearance, 1.0) * step, axis=0)
         point = self.at_points(points, history, law)
         return ContactIterate(
@@ -194,7 +196,8 @@ class ContactFace(eqx.Module):
         """Compute the derivative of the clearance by the points' positions [-], with a share of the curvature."""
         return points.normal * -self._side(clearance) - clearance / points.stretch * _stretch_slope(points, curvature)
 
-    def _friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "_Friction":
+    def friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "Friction":
+        """Compute Coulomb friction at face points; points that `sticks` names do."""
         trial, (slope_x, slope_y) = _trial(points, history), points.slope
         rise = slope_x * trial[0] + slope_y * trial[1]
         squared = trial[0] ** 2 + trial[1] ** 2 + rise**2
@@ -208,7 +211,7 @@ class ContactFace(eqx.Module):
         stiffness = self.contact.stick_stiffness(pressure, self.element_size)
         climb = slope_x * elastic[0] + slope_y * elastic[1]
         tangent = jnp.concatenate([elastic, climb[None]])
-        return _Friction(
+        return Friction(
             traction=-stiffness * tangent,
             stiffness=stiffness * ratio,
             reach=jnp.concatenate([trial, rise[None]]),
@@ -231,8 +234,8 @@ class ContactFace(eqx.Module):
         """
         curvature, sticks = (1.0, None) if law is None else (law.curvature, law.sticks)
         assert points.bend is not None
-        normal, stretch, clearance = points.normal, points.stretch, self._clearance(points)
-        own = self._law(history) if law is None else law.at_its_pressure()
+        normal, stretch, clearance = points.normal, points.stretch, self.clearance(points)
+        own = self.own_law(history) if law is None else law.at_its_pressure()
         pressure, push, slope, push_slope = self._pressure(points, clearance, own)
         if self.imposed is None:
             by_clearance = self._clearance_slope(points, clearance, curvature)
@@ -242,7 +245,7 @@ class ContactFace(eqx.Module):
         bend = jnp.pad(curvature * points.bend, [(0, 1), (0, 1)] + [(0, 0)] * pressure.ndim)
         by_normal = -(bend + normal[:, None] * _stretch_slope(points, curvature)) / stretch
 
-        friction = self._friction(pressure, points, history, sticks)
+        friction = self.friction(pressure, points, history, sticks)
         climbing = jnp.pad(points.slope, [(0, 1)] + [(0, 0)] * pressure.ndim)
         rising = climbing + bend[0] * friction.reach[0] + bend[1] * friction.reach[1]
         plane = np.diag([1.0, 1.0, 0.0]).reshape(3, 3, *[1] * pressure.ndim)
@@ -258,12 +261,9 @@ class ContactFace(eqx.Module):
         pressing = side * (normal[:, None] * by_push + push * by_normal)
         by_position = -jnp.where(pressure > 0, rubbing, 0.0) - pressing
 
-        along = normal[:, None] * normal
-        direction = jnp.where(friction.limited, friction.reach / length, 0.0)
-        eye = np.eye(3).reshape(plane.shape)
-        guard = friction.stiffness * (eye - along - direction[:, None] * direction)
         pushing = push_slope if self.imposed is not None else -slope
-        return friction.traction - side * push * normal, by_position, pushing * along + guard
+        guard = positive_part(normal, pushing, friction.stiffness, friction)
+        return friction.traction - side * push * normal, by_position, guard
 
     def _stick(self, pressure: Array) -> Array:
         return self.contact.stick_stiffness(pressure, self.element_size)
@@ -322,9 +322,27 @@ class ContactFace(eqx.Module):
         return SlipHistory(points.position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
 
 
+def positive_part(
+    normal: PointVector, pushing: Array, sticking: Array, friction: "Friction"
+) -> Float[Array, "3 3 points *faces"]:
+    """Compute the symmetric positive part of contact's stiffness [MPa/mm]: without curvature and sliding's coupling.
+
+    Args:
+        normal: Of the surface.
+        pushing: Stiffness along it.
+        sticking: Stiffness across it, but along the slip of points that slide.
+        friction: Friction there.
+    """
+    along, eye = normal[:, None] * normal, np.eye(3).reshape(3, 3, *[1] * (normal.ndim - 1))
+    length = jnp.where(friction.limited, friction.length, 1.0)
+    direction = jnp.where(friction.limited, friction.reach / length, 0.0)
+    return pushing * along + sticking * (eye - along - direction[:, None] * direction)
+
+
 def _trial(points: FacePoints, history: SlipHistory) -> Float[Array, "2 points *faces"]:
     """Compute the elastic slip [mm] of points that would all stick."""
-    return history.elastic + points.position[:2] - history.position
+    anchor = history.position if points.anchor is None else points.anchor
+    return history.elastic + points.position[:2] - anchor
 
 
 def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
@@ -378,7 +396,9 @@ def can_pair(faces: Sequence[ContactFace]) -> bool:
     return len(alike) == 1 and all(face.imposed is None for face in faces)
 
 
-class _Friction(NamedTuple):
+class Friction(NamedTuple):
+    """Friction at face points: traction [MPa], and what its derivatives take."""
+
     traction: Array
     stiffness: Array  # of the points as they are, slid or not [MPa/mm]
     reach: Array  # elastic slip if all points stuck, in space [mm]

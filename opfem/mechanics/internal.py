@@ -16,6 +16,7 @@ from functools import partial
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,7 +40,7 @@ HOURGLASS = 0.05
 
 
 class SolidBody(eqx.Module):
-    """A deformable body: its material, cells and form.
+    """A deformable body: its material, with numbers for all or for each element, its cells and form.
 
     Every method takes the displacement u [mm] at the nodes, `(3, *nodes)`, and for `hybrid` the cells'
     mean stress [MPa], `(*cells)`, tension positive; None for the other forms.
@@ -48,6 +49,11 @@ class SolidBody(eqx.Module):
     material: AbstractMaterial
     cells: AbstractCells
     form: Form = eqx.field(static=True)
+
+    @property
+    def shear(self) -> Array:
+        """Shear modulus at rest [MPa]; the geometric mean of those of the elements, where they differ."""
+        return typical(self.material.shear)
 
     def energy(self, u: Array, mean_stress: Array | None = None) -> Float[Array, ""]:
         """Compute the strain energy [N mm]."""
@@ -90,7 +96,23 @@ class SolidBody(eqx.Module):
             `(a, b, 3, 3, *cells)`; in a layer, layers first: `(nz, a, b, 3, 3, ny, nx)`.
         """
         fields = () if mean_stress is None else (mean_stress,)
-        return self.cells.in_parts(self._tangent, partial(self._stiffness, bulk=bulk, more=more), u, *fields)
+        of_elements, law = eqx.partition(self.material, lambda number: number.ndim == 3)
+        numbers, structure = jax.tree.flatten(of_elements)
+        if not numbers:
+            return self.cells.in_parts(self._tangent, partial(self._stiffness, bulk=bulk, more=more), u, *fields)
+
+        def body(numbers):
+            material = eqx.combine(jax.tree.unflatten(structure, numbers), law)
+            return eqx.tree_at(lambda body: body.material, self, material)
+
+        def prepare(cells, H, *fields):
+            own, fields = fields[len(fields) - len(numbers) :], fields[: len(fields) - len(numbers)]
+            return body(own)._tangent(cells, H, *fields), own
+
+        def finish(cells, parts):
+            return body(parts[1])._stiffness(cells, parts[0], bulk=bulk, more=more)
+
+        return self.cells.in_parts(prepare, finish, u, *fields, *numbers)
 
     def point_tangent(self, u: Array) -> Float[Array, "3 3 3 3 points *cells"]:
         """Compute dP/dF times the points' volumes [N mm], of a form that measures at each point."""
@@ -209,6 +231,11 @@ class SolidBody(eqx.Module):
         for J, L in itertools.product(range(3), repeat=2):
             K = K + mean[:, None, None, None, J] * own[None, None, :, J, :, L] * mean[None, :, None, None, L]
         return K
+
+
+def typical(numbers: Array) -> Array:
+    """Average a positive number over elements, geometrically; one for all stays as it is."""
+    return numbers if numbers.ndim == 0 else jnp.exp(jnp.mean(jnp.log(numbers)))
 
 
 class LayerBody(SolidBody):

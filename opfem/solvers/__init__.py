@@ -6,7 +6,9 @@ from .newton import Newton as Newton
 from .solution import (
     CONVERGED as CONVERGED,
     RESULTS as RESULTS,
+    BodyResult as BodyResult,
     ConvergenceError as ConvergenceError,
+    ExperimentSolution as ExperimentSolution,
     FaceResult as FaceResult,
     LastConverged as LastConverged,
     Solution as Solution,

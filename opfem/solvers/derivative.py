@@ -22,11 +22,12 @@ from jaxtyping import Array
 
 from ..mechanics.boundary import Bodies
 from .compiling import QuickJit
-from .equilibrium import Forces, Problem, State
+from .equations import AbstractProblem, State
+from .equilibrium import Forces, Problem
 from .newton import Newton, solve_tangent
 from .stencil import Nodal
 from .stepping import Path
-from .tangent import Tangent, Unknowns
+from .tangent import AbstractTangent, Tangent, Unknowns
 
 # Relative residual of the linear solves, in float64, and the corrections that it may take.
 _RTOL = 1e-10
@@ -39,7 +40,9 @@ _KEPT_RTOL = 3e-5
 _KEPT_MOST = 1e-2
 
 
-def follow_path(problem: Problem, start: State, path: Path, length: Array, settings: Newton) -> tuple[State, State]:
+def follow_path(
+    problem: AbstractProblem, start: State, path: Path, length: Array, settings: Newton
+) -> tuple[State, State]:
     """Go through recorded solves again, differentiably.
 
     Returns:
@@ -49,7 +52,7 @@ def follow_path(problem: Problem, start: State, path: Path, length: Array, setti
     settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_CORRECTION_RTOL))
     is_known = length <= path.fraction.shape[0]
 
-    def solved(slowed: Problem, state: State, solve: Path) -> Unknowns:
+    def solved(slowed: AbstractProblem, state: State, solve: Path) -> Unknowns:
         def tangent_solve(matvec, b):
             def solver(transposed):
                 def solved(A, c):
@@ -261,8 +264,8 @@ def _solve_kept(problem: Problem, slot: Slot, b: Unknowns, transposed: Array, se
 
 
 def _solve(
-    problem: Problem,
-    tangent: Tangent,
+    problem: AbstractProblem,
+    tangent: AbstractTangent,
     transposed: bool,
     held: Array,
     matvec,
@@ -278,10 +281,12 @@ def _solve(
     def measure(r: Unknowns) -> tuple[Array, Unknowns | None]:
         if not transposed:
             return problem.size(r), None
-        inside = _inside(problem, r, held)
+        inside = problem.inside(r, held)
         move = tangent.precondition(inside.scaled(problem.stress_scale))
         pushed = problem.size(move.scaled(1.0 / problem.stress_scale))
-        return problem.size(r._replace(u=r.u - inside.u)) + problem.typical_stiffness * pushed, move
+        return problem.size(
+            r._replace(u=jax.tree.map(jnp.subtract, r.u, inside.u))
+        ) + problem.typical_stiffness * pushed, move
 
     # A pass measures what the one before left, and corrects it: so each product appears, and is compiled, once.
     def correct(carry):
@@ -307,32 +312,30 @@ def _solve(
     return jax.tree.map(lambda v: jnp.where(solved & is_known, v, jnp.nan), x)
 
 
-def _transposed_product(problem: Problem, x: Unknowns, fraction: Array, state: State, held: Array):
+def _transposed_product(problem: AbstractProblem, x: Unknowns, fraction: Array, state: State, held: Array):
     """Make the product with the transposed derivative of the balance.
 
     The layer's own force derives from an energy. Its derivative is symmetric, and a product in forward mode takes
     half as long as one in reverse.
     """
-    frozen = problem.own_forces(x, state)
+    frozen = problem.own_forces(x, state).own
 
     def own(x: Unknowns) -> Unknowns:
-        forces = problem.own_forces(x, state)
-        return Unknowns(forces.internal, forces.volume)
+        return problem.own_forces(x, state).own
 
     def others(x: Unknowns) -> Unknowns:
-        forces = problem.own_forces(x, state)._replace(internal=frozen.internal, volume=frozen.volume)
-        return problem.balance(x, fraction, state, held, forces)
+        return problem.balance(x, fraction, state, held, problem.own_forces(x, state).with_own(frozen))
 
     def multiply(v: Unknowns) -> Unknowns:
-        inside = v._replace(u=jnp.asarray(problem.free) * problem.project(v.u, held))
+        inside = v._replace(u=problem.admissible(v.u, held))
         return jax.tree.map(jnp.add, jax.jvp(own, (x,), (inside,))[1], jax.vjp(others, x)[1](v)[0])
 
     return multiply
 
 
 def _correction(
-    problem: Problem,
-    tangent: Tangent,
+    problem: AbstractProblem,
+    tangent: AbstractTangent,
     transposed: bool,
     held: Array,
     r: Unknowns,
@@ -340,13 +343,10 @@ def _correction(
     preconditioned: Unknowns | None = None,
 ) -> tuple[Unknowns, Array]:
     """Solve with the tangent of the balance once, in float32; also return the relative residual it left."""
-    inside = _inside(problem, r, held)
+    inside = problem.inside(r, held)
     result = solve_tangent(problem, tangent, inside, held, settings, transposed, preconditioned)
-    change = _inside(problem, result.x, held)
+    change = problem.inside(result.x, held)
     # Supports and held motion: the balance has a spring to where they are prescribed.
-    placed = change._replace(u=change.u + (r.u - inside.u) / problem.typical_stiffness)
-    return placed, result.relative_residual
-
-
-def _inside(problem: Problem, r: Unknowns, held: Array) -> Unknowns:
-    return r._replace(u=problem.project(jnp.asarray(problem.free) * r.u, held))
+    k = problem.typical_stiffness
+    placed = jax.tree.map(lambda change, r, inside: change + (r - inside) / k, change.u, r.u, inside.u)
+    return change._replace(u=placed), result.relative_residual

@@ -1,6 +1,7 @@
 """From a palpation and a load to the discrete problem: surfaces, supports and dead forces."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +15,10 @@ from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import ELEMENT_FORMS, layer_body
 from ..model import (
     Bonded,
+    Compression,
     Contact,
     Displacement,
+    Experiment,
     HeightField,
     Imprint,
     LayerMesh,
@@ -126,6 +129,9 @@ def _contact(side: Side) -> Contact:
 
 def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
     """Raise ValueError where load and sample contradict each other, or map and layer; warn where these are in doubt."""
+    if isinstance(palpation, Experiment) or isinstance(load, Compression):
+        _check_experiment(palpation, load, start)
+        return
     if not isinstance(load, (Imprint, Traction, Displacement)):
         raise ValueError(f"load must be Imprint, Traction or Displacement, got {type(load).__name__}.")
     if start is not None and type(start) is not type(load):
@@ -153,6 +159,15 @@ def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> No
             )
     if isinstance(load, Imprint):
         check_against_layer("Imprint.thickness", load.thickness, palpation.layer.thickness, palpation.extent, 4)
+
+
+def _check_experiment(experiment: Any, load: Any, start: Any) -> None:
+    if not isinstance(experiment, Experiment):
+        raise ValueError("Compression presses an Experiment. A Palpation takes Imprint, Traction or Displacement.")
+    if not isinstance(load, Compression):
+        raise ValueError(f"An Experiment takes Compression(approach) [mm], got {type(load).__name__}.")
+    if start is not None and not isinstance(start, Compression):
+        raise ValueError(f"start must be a solved Experiment, got a solution under {type(start).__name__}.")
 
 
 def _supports(palpation: Palpation, load: Load) -> Supports:

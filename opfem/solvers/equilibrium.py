@@ -4,7 +4,8 @@ Everything a Newton step needs, with the load fraction as a number from 0 (start
 the friction history of the last converged increment.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,37 +23,11 @@ from ..mechanics.contact_state import (
 )
 from ..mechanics.interaction import Touch, can_pair, paired
 from ..mechanics.internal import LayerBody
+from .equations import AbstractProblem, HoldBalance, State
 from .multigrid import build_multigrid
 from .stencil import Nodal
 from .supports import Supports
 from .tangent import Tangent, Unknowns, couple_volume
-
-
-class State(eqx.Module):
-    """A converged state, with the history that the next increment starts from.
-
-    Attributes:
-        u: Displacement [mm].
-        mean_stress: Mean stress of the elements [MPa] where it is an unknown of its own (`hybrid`), else None.
-        fraction: Load fraction [-].
-        histories: Friction history (`SlipHistory`) of the contact with each body.
-        held: Whether the in-plane hold carries rigid motion.
-        applied: Forces of each body on the layer (`Touching`) [N].
-        work: Work of each body on the layer so far [N mm].
-    """
-
-    u: Nodal
-    mean_stress: Float[Array, "nz ny nx"] | None
-    fraction: Float[Array, ""]
-    histories: Bodies
-    held: Array
-    applied: Bodies
-    work: Bodies
-
-    @property
-    def unknowns(self) -> Unknowns:
-        """What Newton's method solves for."""
-        return Unknowns(self.u, self.mean_stress)
 
 
 class Forces(NamedTuple):
@@ -64,9 +39,18 @@ class Forces(NamedTuple):
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
 
+    @property
+    def own(self) -> Unknowns:
+        """Internal forces [N] and missed volume, which derive from an energy."""
+        return Unknowns(self.internal, self.volume)
 
-class Problem(eqx.Module):
-    """A palpation and its load, discretised."""
+    def with_own(self, own: Unknowns) -> "Forces":
+        """Replace them."""
+        return self._replace(internal=own.u, volume=own.mean_stress)
+
+
+class Problem(AbstractProblem):
+    """One body between rigid surfaces, and its load, discretised."""
 
     body: LayerBody
     low_order: LayerBody | None  # elements of the same nodes that stand in for the body's in the preconditioner
@@ -90,10 +74,6 @@ class Problem(eqx.Module):
         """Mask of the unknowns, 1 where free."""
         return self.supports.free(self.positions.shape[1:])
 
-    def forces(self, x: Unknowns, fraction: Array, state: State) -> Forces:
-        """Compute internal and applied nodal forces [N]."""
-        return self.with_contact(self.own_forces(x, state), self.locate(x.u, fraction), fraction, state)
-
     def own_forces(self, x: Unknowns, state: State) -> Forces:
         """Compute the forces of layer, medium and spring [N], none applied."""
         u, mean_stress = x
@@ -110,7 +90,7 @@ class Problem(eqx.Module):
         groups = [there] if can_pair([face for _, face in there]) else [[one] for one in there]
         return tuple(Touch(tuple(name for name, _ in group), paired([face for _, face in group])) for group in groups)
 
-    def locate(self, u: Nodal, fraction: Array, bends: bool = False) -> tuple[FacePoints, ...]:
+    def locate(self, u: Nodal, fraction: Array, state: State, bends: bool = False) -> tuple[FacePoints, ...]:
         """Locate the quadrature points of `faces`; evaluate the surfaces there, `bends` to second order."""
         x = self.positions + u
         return tuple(touch.face.locate(fraction, self._take(x, touch), bends) for touch in self.faces)
@@ -192,35 +172,21 @@ class Problem(eqx.Module):
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
         return Unknowns(self.project(jnp.asarray(self.free) * self.unbalanced(forces), held), forces.volume)
 
-    def balance(self, x: Unknowns, fraction: Array, state: State, held: Array, own: Forces | None = None) -> Unknowns:
-        """Compute the equations that a converged displacement fulfils, as many as unknowns [N].
-
-        The residual of the free unknowns; a spring to the prescribed value for the others, and to the
-        last state for the rigid motion that is held. `own` are the layer's own forces where they are known.
-        """
-        u = x.u
-        free = jnp.asarray(self.free)
-        forces = self.with_contact(own or self.own_forces(x, state), self.locate(u, fraction), fraction, state)
-        residual = self.residual(forces, held)
-        misplaced = free * (u - state.u) + (1.0 - free) * (u - self.with_imposed(u, fraction))
-        placing = self.typical_stiffness * (misplaced - self.project(free * misplaced, held))
-        return residual._replace(u=residual.u + placing)
+    @property
+    def element_depth(self) -> Array:
+        """Mean height of an element [mm]."""
+        return self.body.cells.element_depth
 
     @property
     def typical_stiffness(self) -> Array:
         """A typical stiffness of a node [N/mm]."""
         hx, hy = self.body.cells.element_spacing
-        return self.body.material.shear * hx * hy / self.body.cells.element_depth
+        return self.body.shear * hx * hy / self.body.cells.element_depth
 
     @property
     def stress_scale(self) -> Array:
         """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]; times volume, a force."""
-        return self.body.material.shear / self.body.cells.element_depth
-
-    def size(self, r: Unknowns) -> Array:
-        """Compute the Euclidean norm of a residual [N]."""
-        parts = jax.tree.leaves(r.scaled(self.stress_scale))
-        return jnp.sqrt(sum((jnp.vdot(part, part) for part in parts), start=jnp.zeros((), r.u.dtype)))
+        return self.body.shear / self.body.cells.element_depth
 
     def force_scale(self, forces: Forces) -> Array:
         """Compute the size of the forces [N] that the residual is measured against."""
@@ -229,7 +195,7 @@ class Problem(eqx.Module):
         hx, hy = self.body.cells.element_spacing
         nodes = self.positions[0, 0].size
         # Below a thousandth of the shear modulus on the whole field, forces count as none.
-        floor = 1e-3 * self.body.material.shear * hx * hy * np.sqrt(nodes)
+        floor = 1e-3 * self.body.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(contact + floor**2)
 
     def _rigid_part(self, face: Float[Array, "2 my mx"]) -> Float[Array, "2 my mx"]:
@@ -246,11 +212,34 @@ class Problem(eqx.Module):
         face = r[:2, 0] - jnp.where(held, self._rigid_part(r[:2, 0]), 0.0)
         return jax.lax.dynamic_update_slice(r, face[:, None], (0, 0, 0, 0))
 
+    def limited(self, change: Nodal, step_limit: float | int | Array) -> Nodal:
+        """Shorten the moves of single nodes that stand out of a step."""
+        reach = jnp.sqrt(jnp.sum(change**2, axis=0))
+        thickness = self.elements[0] * self.element_depth
+        longest = step_limit * thickness + 4.0 * jnp.mean(reach)
+        return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))
+
     def hold_force(self, forces: Forces, held: Array) -> Float[Array, "2 my mx"]:
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
         if forces.spring is not None:
             return forces.spring
         return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]), 0.0)
+
+    def hold_balances(self, forces: Forces, state: State) -> tuple[HoldBalance]:
+        """Compare what the hold carries with what friction could, and with the normal force."""
+        forces = self.reactions(forces)
+        hold = self.hold_force(forces, state.held)
+        X = self.positions[:2, 0]
+        arm = X - jnp.mean(X, axis=(1, 2), keepdims=True)
+        radius = jnp.mean(jnp.sqrt(jnp.sum(arm**2, axis=0)))
+        lateral = jnp.sum(hold, axis=(1, 2))
+        moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
+        carried = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
+        capacity = jnp.zeros((), carried.dtype)
+        for face, touching in zip(self.contacts, forces.applied, strict=True):
+            if face is not None:
+                capacity = capacity + face.contact.friction * jnp.abs(touching.total[2])
+        return (HoldBalance(carried, capacity, jnp.abs(forces.applied.sample.total[2])),)
 
     def tangent(
         self,
@@ -260,8 +249,10 @@ class Problem(eqx.Module):
         laws: tuple[TangentLaw, ...] | None = None,
         transposed: bool = False,
         points: tuple[FacePoints, ...] | None = None,
+        springs: Mapping[str, Array] = MappingProxyType({}),
+        stress_scale: Array | None = None,
     ) -> Tangent:
-        """Assemble the tangent, in float32: it only has to shorten the residual, which is float64.
+        """Assemble the tangent, in float32.
 
         Args:
             x: Displacement [mm], and mean stress [MPa] where it is an unknown.
@@ -269,20 +260,27 @@ class Problem(eqx.Module):
             state: Where the increment started.
             laws: Linearised contact laws; None for the contact's own.
             transposed: Whether to return the transposed tangent.
-            points: `locate(x.u, fraction, bends=True)`, where that is known.
+            points: `locate(x.u, fraction, state, bends=True)`, where that is known.
+            springs: Matrices of faces for the preconditioner alone [N/mm], by the names of `Bodies`.
+            stress_scale: Of the mean stress, where another body's is to be taken.
         """
         u, mean_stress = x
-        body, low_order = _single(self.body), _single(self.low_order or self.body)
-        drag = _single(self._drag(self.viscosity))
-        K = low_order.cell_stiffness(_single(u), _single(mean_stress), more=drag * _LUMPED)
-        pointwise = None if self.low_order is None else body.point_tangent(_single(u))
+        body, low_order = single(self.body), single(self.low_order or self.body)
+        drag = single(self._drag(self.viscosity))
+        K = low_order.cell_stiffness(single(u), single(mean_stress), more=drag * _LUMPED)
+        pointwise = None if self.low_order is None else body.point_tangent(single(u))
         volume = None
         if mean_stress is not None:
-            volume, stiffness = couple_volume(body, self.free, _single(u), _single(self.stress_scale))
+            volume, stiffness = couple_volume(
+                body, self.free, single(u), single(self.stress_scale if stress_scale is None else stress_scale)
+            )
             K = K + stiffness
         faces = {}
-        for touch, at, law in self._each(points or self.locate(u, fraction, bends=True), laws):
-            both = _single(touch.face.stiffness_matrices(at, touch.history(state.histories), law))
+        for name, matrices in springs.items():
+            K = add_matrices(K, single(matrices), name)
+            faces[name] = -single(matrices)
+        for touch, at, law in self._each(points or self.locate(u, fraction, state, bends=True), laws):
+            both = single(touch.face.stiffness_matrices(at, touch.history(state.histories), law))
             for name, (exact, guard) in touch.split(both).items():
                 K = add_matrices(K, guard, name)
                 faces[name] = exact if pointwise is not None else exact - guard
@@ -292,7 +290,7 @@ class Problem(eqx.Module):
         if self.spring is not None or any(self.supports.drifts):
             # Rigid motion must not make the preconditioner singular.
             support = 1e-3 * scale * self.positions[0, 0].size
-            K = add_matrices(K, _single(self._foundation(spring + support)), "window")
+            K = add_matrices(K, single(self._foundation(spring + support)), "window")
         shape = u.shape[1:]
         diagonal = -support * _window_share(shape)
         if pointwise is not None:
@@ -301,7 +299,7 @@ class Problem(eqx.Module):
         tangent = Tangent(
             multigrid=build_multigrid(K, None if free.all() else free, scale),
             faces=Bodies(**faces),
-            diagonal=_single(diagonal),
+            diagonal=single(diagonal),
             free=None if free.all() else jnp.asarray(free, jnp.float32),
             cells=body.cells,
             points=pointwise,
@@ -311,7 +309,7 @@ class Problem(eqx.Module):
 
     def _drag(self, viscosity: Array) -> Array:
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
-        return viscosity * self.body.material.shear * self.body.cells.element_depth
+        return viscosity * self.body.shear * self.body.cells.element_depth
 
     def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 faces"]:
         """Spread an in-plane stiffness [N/mm] evenly over the faces at the window, lumped at nodes."""
@@ -346,7 +344,7 @@ class Problem(eqx.Module):
             return sum(jax.tree.leaves(parts), start=so_far)
 
         histories = {}
-        for touch, at in self._each(points or self.locate(u, fraction)):
+        for touch, at in self._each(points or self.locate(u, fraction, state)):
             history = touch.face.advance(at, touch.history(state.histories))
             histories |= dict(zip(touch.names, separate_histories(history, len(touch.names)), strict=True))
         return State(
@@ -399,6 +397,6 @@ def _window_share(shape: tuple[int, ...]) -> np.ndarray:
     return share / ((shape[1] - 1) * (shape[2] - 1))
 
 
-def _single(tree: Any) -> Any:
+def single(tree: Any) -> Any:
     """Turn every floating-point number into float32."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)

@@ -5,7 +5,7 @@ Displacement and contact pressure are unknowns together, the pressure eliminated
 moves of single nodes that stand out, and is taken whole unless an element would invert.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,10 +16,9 @@ from jaxtyping import Array
 from .._checks import check_positive
 from ..mechanics.contact_state import ContactIterate, FacePoints
 from ..mechanics.face import FaceRule
-from .equilibrium import Forces, Problem, State
+from .equations import AbstractProblem, State
 from .krylov import KrylovResult, fgmres
-from .stencil import Nodal
-from .tangent import Tangent, Unknowns
+from .tangent import AbstractTangent, Unknowns
 
 # Relative residual below which the tangent takes in curvature and area change. Above, the pressures
 # are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
@@ -100,7 +99,7 @@ class IncrementResult(NamedTuple):
     steps: Array
     krylov: Array
     residual: Array  # relative to the force scale
-    forces: Forces
+    forces: Any
 
 
 class _Iterate(NamedTuple):
@@ -109,7 +108,7 @@ class _Iterate(NamedTuple):
     x: Unknowns
     direction: Unknowns
     contact: tuple[ContactIterate, ...]
-    forces: Forces  # at x, as points, size and tolerance
+    forces: Any  # at x, as points, size and tolerance
     points: tuple[FacePoints, ...]
     size: Array
     tolerance: Array
@@ -121,7 +120,7 @@ class _Iterate(NamedTuple):
 
 
 def solve_increment(
-    problem: Problem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
+    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
 ) -> IncrementResult:
     """Find equilibrium at a load fraction, from a converged state and a first guess.
 
@@ -130,7 +129,7 @@ def solve_increment(
     """
 
     def evaluate(x):
-        points = problem.locate(x.u, fraction, bends=True)
+        points = problem.locate(x.u, fraction, state, bends=True)
         forces = problem.with_contact(problem.own_forces(x, state), points, fraction, state)
         size = problem.size(problem.residual(forces, held))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
@@ -172,7 +171,7 @@ def solve_increment(
         r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), held)
         tangent = problem.tangent(it.x, fraction, state, laws, points=it.points)
         solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
-        change = problem.project(_limited(problem, solution.x.u, settings.step_limit), held) * problem.free
+        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), held)
         return it._replace(
             direction=solution.x._replace(u=change),
             contact=problem.follow(it.points, change, state, laws),
@@ -186,7 +185,7 @@ def solve_increment(
         return jax.lax.cond(it.finished, lambda it: it, find_step, it)
 
     x = guess._replace(u=problem.with_imposed(guess.u, fraction))
-    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, x.u.dtype)
+    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, fraction.dtype)
     forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(evaluate, x)[0])
     first = _Iterate(
         x=x,
@@ -214,8 +213,8 @@ def solve_increment(
 
 
 def solve_tangent(
-    problem: Problem,
-    tangent: Tangent,
+    problem: AbstractProblem,
+    tangent: AbstractTangent,
     b: Unknowns,
     held: Array,
     settings: Newton,
@@ -259,11 +258,3 @@ def solve_tangent(
     )
     x = jax.tree.map(lambda part: size * part, result.x)
     return result._replace(x=x.scaled(scale))
-
-
-def _limited(problem: Problem, change: Nodal, step_limit: float | int | Array) -> Nodal:
-    """Shorten the moves of single nodes that stand out of a step."""
-    reach = jnp.sqrt(jnp.sum(change**2, axis=0))
-    thickness = problem.elements[0] * problem.body.cells.element_depth
-    longest = step_limit * thickness + 4.0 * jnp.mean(reach)
-    return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))

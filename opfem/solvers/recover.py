@@ -1,5 +1,7 @@
 """From a converged state to what users read: pressures, tractions, slip, thickness, forces."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
 from ..mechanics.boundary import Body, Touching, put, take, to_touching
+from ..mechanics.contact_state import PointContact
 from ..mechanics.face import (
     area_vector,
     filled_vertices,
@@ -15,6 +18,7 @@ from ..mechanics.face import (
     to_corners,
     tributary_area,
 )
+from ..mechanics.interaction import ContactFace
 from ..mechanics.interface_point import NodalField, locate
 from ..model import Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State
@@ -39,8 +43,10 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     hold = problem.hold_force(forces, state.held)
     _, stress, _ = problem.body.fields(u, state.mean_stress)
     applied = forces.applied
-    sample, sample_stats = _face(problem, "sample", problem.supports.interface, before, state, applied.sample.face)
-    window, window_stats = _face(problem, "window", problem.supports.window, before, state, applied.window.face)
+    sample, sample_stats = face_result(
+        problem, "sample", problem.supports.interface, before, state, applied.sample.face
+    )
+    window, window_stats = face_result(problem, "window", problem.supports.window, before, state, applied.window.face)
     dissipated = [history.dissipated for history in state.histories if history is not None]
     x = problem.positions + u
     hold = jnp.concatenate([hold, jnp.zeros_like(hold[:1])])
@@ -77,9 +83,10 @@ def reached_stretches(problem: Problem, u: Array) -> dict[str, Array]:
     return {"min_stretch": smallest, "max_stretch": largest}
 
 
-def _face(
+def face_result(
     problem: Problem, body: Body, support: str, before: State, state: State, force: Array
 ) -> tuple[FaceResult, dict[str, Array]]:
+    """Recover what acts on one face of a body, and how near its rigid surface came."""
     face, old, new = (getattr(bodies, body) for bodies in (problem.contacts, before.histories, state.histories))
     level = 0 if body == "window" else -1
     X, u = problem.positions[:, level], state.u[:, level]
@@ -103,22 +110,42 @@ def _face(
     def on_nodes(values):
         return filled(to_touching(to_corners(values, face.rule), problem.elements).face)
 
-    point = face.at_points(points, old)
     weight = size(area_vector(*points.tangents))
     weight = weight if face.shares is None else weight * face.shares[:, : weight.shape[1]]
+    slip, status, stats = at_nodes(face, face.at_points(points, old), new.slip, weight, on_nodes)
+    return FaceResult(pressure, traction, slip, status), stats
+
+
+def at_nodes(
+    face: ContactFace, point: PointContact, slip: Array, weight: Array, on_nodes: Callable[[Array], Array]
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Average contact at the points of a face over its nodes: slip [mm] and status; and how near the bodies came [mm].
+
+    Args:
+        face: The face.
+        point: Contact at its points.
+        slip: Slip so far there [mm].
+        weight: Area that the points stand for [mm²].
+        on_nodes: Integrates what the points have, per unit of (ξ, η), against the shape functions of the nodes.
+    """
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
     share = on_nodes(jnp.stack([weight, load, load * point.slips], axis=1))
     status = jnp.where(share[1] > 0, jnp.where(share[2] > 0.5 * share[1], SLIP, STICK), OPEN)
-    slip = on_nodes(jnp.moveaxis(new.slip * weight, 1, 0)) / share[0]
+    slip = on_nodes(jnp.moveaxis(slip * weight, 1, 0)) / jnp.where(share[0] > 0, share[0], 1.0)
+    if face.imposed is not None:
+        zero = jnp.zeros((), weight.dtype)
+        return slip, status, {"approach": zero, "max_penetration": zero}
     total = jnp.sum(load)
-    towards = face.contact.law.zero_pressure_clearance - point.clearance
-    imposed = face.imposed is not None
+    towards = face.own_contact.law.zero_pressure_clearance - point.clearance
     closed = jnp.where(point.pressure > 0, -point.clearance, 0.0)
-    stats = {
-        "approach": zero if imposed else jnp.sum(load * towards) / jnp.where(total > 0, total, 1.0),
-        "max_penetration": zero if imposed else jnp.maximum(jnp.max(closed), 0.0),
-    }
-    return FaceResult(pressure, traction, slip, status), stats
+    return (
+        slip,
+        status,
+        {
+            "approach": jnp.sum(load * towards) / jnp.where(total > 0, total, 1.0),
+            "max_penetration": jnp.maximum(jnp.max(closed), 0.0),
+        },
+    )
 
 
 def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete
 from ..measurement import ThicknessMap
-from ..model import Load, Palpation, unstable_stretch
-from .equilibrium import State
+from ..model import Compression, Experiment, Load, Palpation, unstable_stretch
+from .equations import State
 from .explicit_step import Motion
 
 OPEN, STICK, SLIP = 0, 1, 2
@@ -60,10 +60,11 @@ def is_failure(result: RESULTS) -> Bool[Array, ""]:
     return ~functools.reduce(jnp.logical_or, [result == getattr(RESULTS, name) for name in CONVERGED])
 
 
-def judged(solution: "Solution") -> "Solution":
+def judged(solution: "AnySolution") -> "AnySolution":
     """Note in stats and status where a solve stretched elements beyond what its law is stable for."""
     stats = solution.stats
-    unstable = unstable_stretch(solution.palpation.layer.material, stats["min_stretch"], stats["max_stretch"])
+    layer = solution.palpation.layer if isinstance(solution, Solution) else solution.experiment.layer
+    unstable = unstable_stretch(layer.material, stats["min_stretch"], stats["max_stretch"])
     solution = dataclasses.replace(solution, stats={**stats, "unstable_stretch": unstable})
     known = concrete(unstable)
     if known is not None and not known:
@@ -133,6 +134,11 @@ class Solution(eqx.Module):
     load: Load
 
     @property
+    def interface(self) -> FaceResult:
+        """What acts at the sample–layer interface."""
+        return self.sample
+
+    @property
     def pressure(self) -> Float[Array, "*maps my mx"]:
         """Contact pressure on the sample [MPa], on the current area."""
         return self.sample.pressure
@@ -153,9 +159,97 @@ class Solution(eqx.Module):
         return self.sample.status
 
 
+class BodyResult(eqx.Module):
+    """One body of a solved experiment.
+
+    Attributes:
+        displacement: `(3, nz+1, ny+1, nx+1)` [mm].
+        positions: Reference positions of the nodes, same shape [mm].
+        mean_stress: Mean stress of "hybrid" elements `(nz, ny, nx)` [MPa]; None for others.
+        stress: Cauchy stress, mean over each element `(3, 3, nz, ny, nx)` [MPa].
+        min_stretch: Smallest principal stretch, volume change taken out [-].
+        max_stretch: Largest.
+    """
+
+    displacement: Float[Array, "3 mz my mx"]
+    positions: Float[Array, "3 mz my mx"]
+    mean_stress: Float[Array, "nz ny nx"] | None
+    stress: Float[Array, "3 3 nz ny nx"]
+    min_stretch: Float[Array, ""]
+    max_stretch: Float[Array, ""]
+
+
+class ExperimentSolution(eqx.Module):
+    """The solved experiment: what a `Solution` says of the layer and its interface, and both bodies.
+
+    Attributes:
+        layer: The layer.
+        sample: The sample.
+        window: What acts on the layer at the window.
+        interface: What acts on the layer at its interface with the sample.
+        plate: What acts on the sample at the plate.
+        thickness: Thickness of the deformed layer as a spatial map on the interface's nodes [mm], as OCT sees it.
+        stats: Iterations, residual, energies, forces [N]; see `solve`.
+        result: How the solve ended.
+        last_converged: The last converged state and its load fraction.
+        experiment: The experiment that was solved.
+        load: Its load.
+    """
+
+    layer: BodyResult
+    sample: BodyResult
+    window: FaceResult
+    interface: FaceResult
+    plate: FaceResult
+    thickness: ThicknessMap
+    stats: dict[str, Any]
+    result: RESULTS
+    last_converged: LastConverged
+    experiment: Experiment
+    load: Compression
+
+    @property
+    def displacement(self) -> Float[Array, "*maps 3 mz my mx"]:
+        """Displacement of the layer's nodes [mm]."""
+        return self.layer.displacement
+
+    @property
+    def positions(self) -> Float[Array, "*maps 3 mz my mx"]:
+        """Reference positions of the layer's nodes [mm]."""
+        return self.layer.positions
+
+    @property
+    def stress_zz(self) -> Float[Array, "*maps ny nx"]:
+        """Cauchy stress σ_zz, mean over each of the layer's top elements [MPa]."""
+        return self.layer.stress[..., 2, 2, -1, :, :]
+
+    @property
+    def pressure(self) -> Float[Array, "*maps my mx"]:
+        """Contact pressure between layer and sample [MPa], on the current area."""
+        return self.interface.pressure
+
+    @property
+    def traction(self) -> Float[Array, "*maps 3 my mx"]:
+        """Force on the layer at the interface per reference area [MPa]."""
+        return self.interface.traction
+
+    @property
+    def slip(self) -> Float[Array, "*maps 2 my mx"]:
+        """Slip of the layer along the sample [mm]."""
+        return self.interface.slip
+
+    @property
+    def contact_status(self) -> Int[Array, "*maps my mx"]:
+        """Status of the interface: 0 open, 1 stick, 2 slip."""
+        return self.interface.status
+
+
+AnySolution = TypeVar("AnySolution", Solution, ExperimentSolution)
+
+
 class ConvergenceError(RuntimeError):
     """A solve did not reach its load. `solution` holds its status and last converged state."""
 
-    def __init__(self, message: str, solution: Solution):
+    def __init__(self, message: str, solution: "Solution | ExperimentSolution"):
         super().__init__(message)
         self.solution = solution

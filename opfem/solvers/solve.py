@@ -1,42 +1,77 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
-from typing import Any
+from typing import Any, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..model import Load, Palpation
+from ..model import Compression, Experiment, Imprint, Load, Palpation
 from .compiling import QuickJit, compiled_meanwhile, is_traced
 from .derivative import follow_path
 from .discretise import check_compatible, discretise
-from .equilibrium import Problem, State
+from .equations import AbstractProblem, State
+from .experiment import discretise_experiment
 from .explicit import Explicit, solve_explicit
 from .newton import Newton
 from .progress import Progress
 from .recover import recover
-from .solution import RESULTS, ConvergenceError, LastConverged, Solution, is_failure, judged
+from .recover_experiment import recover_experiment
+from .solution import (
+    RESULTS,
+    AnySolution,
+    ConvergenceError,
+    ExperimentSolution,
+    LastConverged,
+    Solution,
+    is_failure,
+    judged,
+)
 from .stepping import Stepping, attempt, begin, outcome, unfinished
 
 # Compiling takes as long whatever the mesh.
 _COMPILES = "the solver, about 10 s the first time"
 
 
+@overload
 def solve(
     palpation: Palpation,
     load: Load,
+    solver: Newton | Explicit = ...,
+    *,
+    throw: bool = ...,
+    start: Solution | None = ...,
+    progress: bool = ...,
+) -> Solution: ...
+
+
+@overload
+def solve(
+    palpation: Experiment,
+    load: Compression,
+    solver: Newton = ...,
+    *,
+    throw: bool = ...,
+    start: ExperimentSolution | None = ...,
+    progress: bool = ...,
+) -> ExperimentSolution: ...
+
+
+def solve(
+    palpation: Palpation | Experiment,
+    load: Load | Compression,
     solver: Newton | Explicit = Newton(),
     *,
     throw: bool = True,
-    start: Solution | None = None,
+    start: Solution | ExperimentSolution | None = None,
     progress: bool = True,
-) -> Solution:
-    """Solve a palpation under a load.
+) -> Solution | ExperimentSolution:
+    """Solve a palpation, or an experiment with a deformable sample, under a load.
 
     Args:
-        palpation: The experiment.
-        load: `Imprint`, `Traction` or `Displacement`.
+        palpation: A `Palpation`, or an `Experiment`.
+        load: `Imprint`, `Traction` or `Displacement` of a palpation; `Compression` of an experiment.
         solver: Method and settings: `Newton` (implicit statics) or `Explicit` (dynamics).
         throw: Raise where the solve fails. False: return NaN fields, the status in `result`
             and the last converged state in `last_converged`.
@@ -51,7 +86,8 @@ def solve(
         `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
         `max_penetration` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
         stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
-        law is unstable, 0 if it was stable as far as it was stretched).
+        law is unstable, 0 if it was stable as far as it was stretched). Of an experiment `force_sample`
+        is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.
@@ -75,7 +111,7 @@ def solve(
         problem, initial = prepare(palpation, load, load_start, solver, first, traced)
         with compiled_meanwhile([] if traced else [(finish, (problem, initial, palpation, load))]):
             stepping = run(problem, initial, solver, bar)
-        if getattr(load, "correct_approach", False):
+        if isinstance(load, Imprint) and load.correct_approach:
             problem, stepping = _correct_approach(palpation, load, solver, problem, stepping, run, bar)
         bar.stage("fields")
         solution = judged(finish(problem, stepping, palpation, load))
@@ -83,12 +119,14 @@ def solve(
 
 
 @QuickJit
-def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[Problem, Stepping]:
-    """Discretise a palpation under a load, and begin at a state or at rest."""
-    problem = discretise(palpation, load, load_start, solver.face_rule)
+def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[AbstractProblem, Stepping]:
+    """Discretise a palpation or an experiment under a load, and begin at a state or at rest."""
+    build = discretise_experiment if isinstance(palpation, Experiment) else discretise
+    problem = build(palpation, load, load_start, solver.face_rule)
     initial = problem.initial_state()
     if state is None:
-        return problem, begin(initial, solver, traced)
+        stepping = begin(initial, solver, traced)
+        return problem, stepping._replace(before=problem.touching(initial, stepping.increment))
     if jax.tree.structure(state) != jax.tree.structure(initial):
         raise ValueError(
             "A solve continues on the same faces, with the same kind of load: start has other contact, friction or "
@@ -104,7 +142,7 @@ compiled_attempt = QuickJit(attempt)
 _compiled_follow_path = QuickJit(follow_path)
 
 
-def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
+def _run_with_progress(problem: AbstractProblem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     while bool(unfinished(stepping)):
         stepping = compiled_attempt(problem, stepping, solver)
         fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.viscosity > 0) else ""
@@ -112,7 +150,7 @@ def _run_with_progress(problem: Problem, stepping: Stepping, solver: Newton, bar
     return stepping
 
 
-def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
+def _run_differentiable(problem: AbstractProblem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     frozen, start, settings = jax.lax.stop_gradient((problem, stepping, solver))
     if is_traced((frozen, start, settings)):
         end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
@@ -123,7 +161,7 @@ def _run_differentiable(problem: Problem, stepping: Stepping, solver: Newton, ba
     return end._replace(before=before, state=state, path=None)
 
 
-def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> tuple[Problem, Stepping]:
+def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> tuple[AbstractProblem, Stepping]:
     """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
     for _ in range(2):
         offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
@@ -148,15 +186,13 @@ def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> t
 
 
 @QuickJit
-def _approach(problem: Problem, s: Stepping, load: Load) -> Array:
+def _approach(problem: AbstractProblem, s: Stepping, load: Load) -> Array:
     return recover(problem, s.before, s.state, load).stats["approach"]
 
 
 @QuickJit
-def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> Solution:
+def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
     """Make the solution from where a solve ended."""
-    fields = recover(problem, s.before, s.state, load)
-    result = outcome(s)
     ok = s.state.fraction >= 1.0
     counts = {
         "newton_steps": s.newton,
@@ -165,12 +201,17 @@ def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> S
         "attempts": s.attempts,
         "residual": s.residual,
         "load_fraction": s.state.fraction,
-        **fields.stretches,
     }
 
     def kept(field):
         return jnp.where(ok, field, jnp.nan) if jnp.issubdtype(field.dtype, jnp.inexact) else field
 
+    last = LastConverged(s.state.unknowns.u, s.state.fraction, s.state)
+    if isinstance(palpation, Experiment):
+        return _finish_experiment(problem, s, palpation, load, counts, kept, last)
+    fields = recover(problem, s.before, s.state, load)
+    result = outcome(s)
+    counts = {**counts, **fields.stretches}
     public = jax.tree.map(kept, (s.state.u, fields.sample, fields.window, fields.stress_zz, fields.stats))
     displacement, sample, window, stress_zz, stats = public
     return Solution(
@@ -182,13 +223,35 @@ def finish(problem: Problem, s: Stepping, palpation: Palpation, load: Load) -> S
         stress_zz=stress_zz,
         stats={**counts, **stats},
         result=result,
-        last_converged=LastConverged(s.state.u, s.state.fraction, s.state),
+        last_converged=last,
         palpation=palpation,
         load=load,
     )
 
 
-def _raise_on_failure(solution: Solution, traced: bool) -> Solution:
+def _finish_experiment(problem, s: Stepping, experiment, load, counts, kept, last) -> ExperimentSolution:
+    fields = recover_experiment(problem, s.before, s.state, load)
+    fields = eqx.tree_at(lambda f: f.thickness.values, fields, kept(fields.thickness.values))
+    layer, sample, window, interface, plate, stats = jax.tree.map(
+        kept, (fields.layer, fields.sample, fields.window, fields.interface, fields.plate, fields.stats)
+    )
+    reached = {"min_stretch": fields.layer.min_stretch, "max_stretch": fields.layer.max_stretch}
+    return ExperimentSolution(
+        layer=layer,
+        sample=sample,
+        window=window,
+        interface=interface,
+        plate=plate,
+        thickness=fields.thickness,
+        stats={**counts, **reached, **stats},
+        result=outcome(s),
+        last_converged=last,
+        experiment=experiment,
+        load=load,
+    )
+
+
+def _raise_on_failure(solution: AnySolution, traced: bool) -> AnySolution:
     failed = is_failure(solution.result)
     if traced:
         return solution.result.error_if(solution, failed)

@@ -9,15 +9,17 @@ the full increment, solve by solve, and the medium is taken away as the motion d
 without viscosity are accepted.
 """
 
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..mechanics.staging import apart
-from .equilibrium import Forces, Problem, State
+from .equations import AbstractProblem, HoldBalance, State
 from .newton import Newton, solve_increment
 from .solution import RESULTS
 from .tangent import Unknowns
@@ -109,7 +111,7 @@ class Stepping(NamedTuple):
 
 def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
     """Start at a converged state."""
-    dtype = state.u.dtype
+    dtype = state.fraction.dtype
     none, zero, no = jnp.zeros((), int), jnp.zeros((), dtype), jnp.asarray(False)
     slot = Path(state.unknowns, zero, no, zero)
     path = jax.tree.map(lambda v: jnp.zeros((settings.max_path, *v.shape), v.dtype), slot)
@@ -144,7 +146,7 @@ def unfinished(s: Stepping) -> Array:
     return ~s.failed & ((s.state.fraction < 1.0) | releasable | (s.missed_gap > 0))
 
 
-def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
+def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping:
     """Try one load increment, or one solve of a snap; keep it if it converges, else return to the last state."""
     left = 1.0 - s.state.fraction
     increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
@@ -164,7 +166,7 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
     result = solve_increment(
         slowed, s.origin, guess, fraction, held, eqx.tree_at(lambda n: [n.rtol, n.max_steps], settings, limits)
     )
-    can_release, slides = _hold_balance(problem, result.forces, result.state)
+    can_release, slides = _hold_balance(problem.hold_balances(result.forces, result.state))
     missed_gap = problem.missed_gap(s.origin, result.state)
     none = s._replace(state=None, before=None, origin=None, path=None)
     trial = _Trial(
@@ -173,9 +175,9 @@ def attempt(problem: Problem, s: Stepping, settings: Newton) -> Stepping:
         snapping=snapping,
         converged=result.converged,
         steps=result.steps,
-        furthest=jnp.max(jnp.abs(result.state.u - s.origin.u)),
+        furthest=_furthest(result.state.u, s.origin.u),
         missed_gap=missed_gap,
-        no_gap=_NO_GAP * problem.body.cells.element_depth,
+        no_gap=_NO_GAP * problem.element_depth,
     )
     next_s, (accepted, goes_on, moves_on) = apart(_decided, none, trial, settings)
     state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
@@ -281,27 +283,24 @@ def _where(condition: Array, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _hold_balance(problem: Problem, forces: Forces, state: State) -> tuple[Array, Array]:
-    """Compare what the hold carries with what friction could, and with the normal force."""
-    forces = problem.reactions(forces)
-    hold = problem.hold_force(forces, state.held)
-    X = problem.positions[:2, 0]
-    arm = X - jnp.mean(X, axis=(1, 2), keepdims=True)
-    radius = jnp.mean(jnp.sqrt(jnp.sum(arm**2, axis=0)))
-    lateral = jnp.sum(hold, axis=(1, 2))
-    moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
-    carried = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
-    capacity = jnp.zeros((), carried.dtype)
-    for face, touching in zip(problem.contacts, forces.applied, strict=True):
-        if face is not None:
-            capacity = capacity + face.contact.friction * jnp.abs(touching.total[2])
-    normal = jnp.abs(forces.applied.sample.total[2])
-    return (capacity > 0) & (carried <= _RELEASE_MARGIN * capacity), carried > _BALANCED * normal
+def _furthest(u: PyTree, before: PyTree) -> Array:
+    """Compute the largest move along one axis [mm]."""
+    moves = jax.tree.map(lambda u, before: jnp.max(jnp.abs(u - before)), u, before)
+    return functools.reduce(jnp.maximum, jax.tree.leaves(moves))
+
+
+def _hold_balance(bodies: Sequence[HoldBalance]) -> tuple[Array, Array]:
+    """Tell whether friction could carry what the hold carries of every body, and whether that is more than rounding."""
+    can = [(body.capacity > 0) & (body.carried <= _RELEASE_MARGIN * body.capacity) for body in bodies]
+    slides = [body.carried > _BALANCED * body.normal for body in bodies]
+    return functools.reduce(jnp.logical_and, can), functools.reduce(jnp.logical_or, slides)
 
 
 def outcome(s: Stepping) -> RESULTS:
     """Name how the solve ended."""
     failure = RESULTS.where(s.exhausted, RESULTS.max_increments_reached, RESULTS.increment_too_small)
-    failure = RESULTS.where(jnp.all(jnp.isfinite(s.state.u)), failure, RESULTS.nonfinite)
+    failure = RESULTS.where(
+        jnp.stack([jnp.all(jnp.isfinite(u)) for u in jax.tree.leaves(s.state.u)]).all(), failure, RESULTS.nonfinite
+    )
     success = RESULTS.where(s.state.held & s.slides, RESULTS.slides_off, RESULTS.successful)
     return RESULTS.where(s.state.fraction >= 1.0, success, failure)

@@ -5,12 +5,12 @@ Displacement alone, or displacement and the elements' mean stress: a saddle poin
 """
 
 import itertools
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.boundary import Bodies, put, take, to_touching
 from ..mechanics.internal import LayerBody
@@ -23,7 +23,7 @@ VOLUME_GUARD = 20.0
 
 
 class Unknowns(NamedTuple):
-    """What Newton's method solves for, and residuals of the same shape.
+    """What Newton's method solves for, and residuals of the same shape; in a stack, tuples over bodies.
 
     Attributes:
         u: Displacement [mm]; as a residual, force [N].
@@ -31,12 +31,24 @@ class Unknowns(NamedTuple):
             it is no unknown.
     """
 
-    u: Nodal
-    mean_stress: Float[Array, "nz ny nx"] | None = None
+    u: PyTree
+    mean_stress: PyTree = None
 
     def scaled(self, scale: Array) -> "Unknowns":
         """Multiply mean stress by a scale: over a linear system's scale it is in mm, its residual in N."""
-        return self._replace(mean_stress=None if self.mean_stress is None else scale * self.mean_stress)
+        return self._replace(mean_stress=jax.tree.map(lambda stress: scale * stress, self.mean_stress))
+
+
+class AbstractTangent(Protocol):
+    """The linear operator of one Newton step, in float32, and its preconditioner."""
+
+    def apply(self, x: Unknowns) -> Unknowns:
+        """Multiply with unknowns."""
+        ...
+
+    def precondition(self, r: Unknowns) -> Unknowns:
+        """Approximate the solution."""
+        ...
 
 
 class VolumeCoupling(NamedTuple):

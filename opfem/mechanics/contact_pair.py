@@ -1,0 +1,223 @@
+"""Contact and friction of two deformable faces: points of the lower body's face against the upper body's.
+
+Each face point of the lower body is looked up along z on a smooth surface through the moving nodes of the upper body's
+face (`smooth_face`). Law and friction are those of a face against a rigid surface; the opposite force goes to the
+upper body's nodes by the weights of that surface, so that action and reaction are equal to rounding. Friction remembers
+material points of the upper body: rigid motion of both gives no slip.
+
+Source:
+    Zimmerman and Ateshian, J. Biomech. Eng. 140 (2018) 081013 (ray tracing from face points).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .contact_state import ContactIterate, Corners, FacePoints, PointContact, SlipHistory, TangentLaw
+from .face import CORNERS, area_vector, quadrature, size, surface_tangents, to_corners
+from .interaction import ContactFace, positive_part
+from .kinematics import contract
+from .smooth_face import BEYOND, Place, patch
+
+# Newton steps to find the place of a point, from where it would be had the upper face not moved.
+_FINDING_STEPS = 6
+# Stiffness of the lower body's contact springs in the preconditioner, over its shear modulus per mm. A stack is solved
+# upper body first, with all of its springs, then the lower one almost without: 13 to 21 iterations for ratios of the
+# moduli from 0.3 to 5, in two dimensions, with 1 to 4 of these; 33 to 56 with all springs in both (CONTACT_PAIR.md, 5).
+SOFT = 2.0
+
+UpperNodes = Float[Array, "3 my mx"]
+
+
+class PairPoints(NamedTuple):
+    """Where the points of the lower face are, and where they meet the upper face.
+
+    Attributes:
+        at: The points, and the upper face's height and slope there.
+        place: The material point met, x and y, in cells of the upper face's grid.
+        overlap: Share of the point that the upper face reaches over [-]: 1 but at its rim.
+    """
+
+    at: FacePoints
+    place: Place
+    overlap: Float[Array, "points *faces"]
+
+
+class PairForce(NamedTuple):
+    """Force [N] at the corners of the lower body's faces, and at the nodes of the upper body's face."""
+
+    lower: Corners
+    upper: UpperNodes
+
+
+class ContactPair(eqx.Module):
+    """Contact between the faces of two deformable bodies.
+
+    Attributes:
+        face: Law, friction and quadrature of the lower face, which is above nothing: its rigid surface is not used.
+        spacing: Of the upper face's grid [mm].
+        lower_spacing: Of the lower face's grid [mm].
+        rims: Whether the upper face ends at x0, x1, y0, y1; at a plane of symmetry it does not.
+        soft: Stiffness of the lower body's springs in the preconditioner [MPa/mm] (`SOFT`).
+    """
+
+    face: ContactFace
+    spacing: Float[Array, "2"]
+    lower_spacing: Float[Array, "2"]
+    soft: Array
+    rims: tuple[bool, bool, bool, bool] = eqx.field(static=True)
+
+    def initial_history(self, x: Corners) -> SlipHistory:
+        """Build the history of faces that have not slipped."""
+        history = self.face.initial_history(x)
+        return eqx.tree_at(lambda h: h.position, history, self._unmoved(history.position))
+
+    def locate(self, fraction: Array, x: Corners, upper: UpperNodes, history: SlipHistory) -> PairPoints:
+        """Find where the points of faces with corners x [mm] meet the face with nodes `upper` [mm].
+
+        The search has no derivative; two Newton steps after it carry them, one order each.
+        """
+        position, *tangents = surface_tangents(x, self.face.rule)
+        found = self._find(jax.lax.stop_gradient(position[:2]), jax.lax.stop_gradient(upper))
+        around = patch(upper, found)
+        place = jax.lax.fori_loop(0, 2, lambda _, place: place + around.at(place).step_towards(position[:2]), found)
+        place = jnp.where(self._is_near(found, upper), place, found)
+        met = around.at(place)
+        anchor = patch(upper, history.position).at(history.position).position[:2]
+        at = FacePoints(fraction, position, jnp.stack(tangents), met.position[2], met.slope, None, anchor)
+        return PairPoints(at, place, self._overlap(place, upper))
+
+    def at_points(self, points: PairPoints, history: SlipHistory, law: TangentLaw | None = None) -> PointContact:
+        """Evaluate contact at the points, with the contact's own law or a linearised one."""
+        return self.face.at_points(points.at, history, law)
+
+    def area(self, points: PairPoints) -> Float[Array, "points *faces"]:
+        """Compute the area per unit of (ξ, η) that is in contact, or would be [mm²]."""
+        return points.overlap * size(area_vector(*points.at.tangents))
+
+    def force(self, points: PairPoints, upper: UpperNodes, history: SlipHistory, law: TangentLaw | None) -> PairForce:
+        """Compute the forces on both faces [N]; of `upper`, only its shape is needed."""
+        density = self.at_points(points, history, law).traction * self.area(points)
+        weights = quadrature(self.face.rule).weights[:, None]
+
+        def under(nodes):
+            return patch(nodes, jax.lax.stop_gradient(points.place)).at(points.place).position
+
+        (onto,) = jax.vjp(under, jnp.zeros_like(upper))[1](density * weights)
+        return PairForce(to_corners(jnp.moveaxis(density, 1, 0), self.face.rule), -onto)
+
+    def linearised(
+        self, fraction: Array, x: Corners, upper: UpperNodes, history: SlipHistory, law: TangentLaw | None
+    ) -> Callable[[Corners, UpperNodes], PairForce]:
+        """Linearise the forces [N] by the positions of both faces [mm]."""
+        curvature = 1.0 if law is None else law.curvature
+
+        def partly(v):
+            return curvature * v + (1.0 - curvature) * jax.lax.stop_gradient(v)
+
+        def force(x, upper):
+            points = self.locate(fraction, x, upper, history)
+            at = points.at._replace(slope=partly(points.at.slope), tangents=partly(points.at.tangents))
+            points = PairPoints(at, partly(points.place), partly(points.overlap))
+            return self.force(points, upper, history, None if law is None else law.at_its_pressure())
+
+        return jax.linearize(force, x, upper)[1]
+
+    def guards(
+        self, points: PairPoints, upper: UpperNodes, history: SlipHistory, law: TangentLaw | None
+    ) -> tuple[Float[Array, "4 4 3 3 faces"], Float[Array, "4 4 3 3 upper_faces"]]:
+        """Compute the springs of each body's own preconditioner [N/mm], as matrices of its faces: lower, upper."""
+        face, at = self.face, points.at
+        clearance = face.clearance(at)
+        own = face.own_law(history) if law is None else law
+        pressure, slope = jax.jvp(own, (clearance,), (jnp.ones_like(clearance),))
+        friction = face.friction(pressure, at, history, None if law is None else law.sticks)
+
+        def softened(k):
+            return k * self.soft / (k + self.soft)
+
+        area = self.area(points)
+        soft = positive_part(at.normal, softened(-slope), softened(friction.stiffness), friction) * area
+        full = positive_part(at.normal, -slope, friction.stiffness, friction) * area
+        q = quadrature(face.rule)
+        lower = contract(np.einsum("q,qa,qb->abq", q.weights, q.N, q.N), jnp.moveaxis(soft, 2, 0))
+        return lower, self._gathered(points.place, full * q.weights[:, None], upper)
+
+    def tangent_law(
+        self, points: PairPoints, history: SlipHistory, iterate: ContactIterate, curvature: Array
+    ) -> TangentLaw:
+        """Linearise contact at the points."""
+        return self.face.tangent_law(points.at, history, iterate, curvature)
+
+    def follow(
+        self, points: PairPoints, change: Corners, upper: UpperNodes, history: SlipHistory, law: TangentLaw
+    ) -> ContactIterate:
+        """Compute what the next iteration remembers once a part of the step of both faces is taken."""
+        at = points.at
+        step = jnp.moveaxis(contract(quadrature(self.face.rule).N, change), 1, 0)
+        apart = patch(upper, points.place).at(points.place).position - step
+        opening = apart[2] - at.slope[0] * apart[0] - at.slope[1] * apart[1]
+        clearance = self.face.clearance(at) + opening / at.stretch
+        point = self.at_points(points, history, law)
+        return ContactIterate(law.pressure, jnp.where(point.sliding, point.elastic, 0.0), law(clearance) - law.pressure)
+
+    def advance(self, points: PairPoints, history: SlipHistory) -> SlipHistory:
+        """Compute the history at the end of an increment."""
+        point = self.at_points(points, history)
+        work = self.area(points) * jnp.sum(point.friction * point.slid, axis=0)
+        dissipated = history.dissipated - jnp.sum(jnp.tensordot(quadrature(self.face.rule).weights, work, 1))
+        return SlipHistory(points.place, point.elastic, history.slip + point.slid, dissipated, point.pressure)
+
+    def _unmoved(self, xy: Float[Array, "2 *points"]) -> Place:
+        return xy / self.spacing.reshape(2, *[1] * (xy.ndim - 1))
+
+    def _find(self, xy: Float[Array, "2 *points"], upper: UpperNodes) -> Place:
+        def closer(_, place):
+            return self._clipped(place + patch(upper, place).at(place).step_towards(xy), upper)
+
+        return jax.lax.fori_loop(0, _FINDING_STEPS, closer, self._clipped(self._unmoved(xy), upper))
+
+    def _clipped(self, place: Place, upper: UpperNodes) -> Place:
+        return jnp.clip(place, -BEYOND, self._last(place, upper) + BEYOND)
+
+    def _is_near(self, place: Place, upper: UpperNodes) -> Array:
+        """Tell whether the search ended on the upper face, or just beside it."""
+        return jnp.all((place > -BEYOND) & (place < self._last(place, upper) + BEYOND), axis=0)
+
+    def _last(self, place: Place, upper: UpperNodes) -> np.ndarray:
+        return np.array(upper.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 1.0
+
+    def _overlap(self, place: Place, upper: UpperNodes) -> Float[Array, "points *faces"]:
+        """Compute the share of each point that the upper face reaches over.
+
+        A point that slid off a rim at full pressure would make Newton's method alternate between two states for ever.
+        """
+        q = quadrature(self.face.rule)
+        outermost = float(np.min(q.N @ np.array([x for x, _ in CORNERS])))
+        reach = 2.0 * outermost if outermost > 0 else 1.0
+        share = jnp.ones_like(place[0])
+        for axis, n in enumerate(upper.shape[:0:-1]):
+            width = reach * self.lower_spacing[axis] / self.spacing[axis]
+            inside = (place[axis], n - 1.0 - place[axis])
+            for distance, is_rim in zip(inside, self.rims[2 * axis : 2 * axis + 2], strict=True):
+                if is_rim:
+                    share = share * jnp.clip(0.5 + distance / width, 0.0, 1.0)
+        return share
+
+    def _gathered(
+        self, place: Place, springs: Float[Array, "3 3 points faces"], upper: UpperNodes
+    ) -> Float[Array, "4 4 3 3 upper_faces"]:
+        """Add the springs of points into the matrices of the upper body's faces, bilinear within them."""
+        my, mx = upper.shape[1:]
+        cell = patch(upper, place).cell
+        x, y = jnp.clip(place - cell, 0.0, 1.0)
+        weights = jnp.stack([(x if i else 1.0 - x) * (y if j else 1.0 - y) for i, j in CORNERS])
+        each = weights[:, None, None, None] * weights[None, :, None, None] * springs
+        index = (cell[1] * (mx - 1) + cell[0]).reshape(-1)
+        whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), springs.dtype)
+        return whole.at[..., index].add(each.reshape(4, 4, 3, 3, -1))

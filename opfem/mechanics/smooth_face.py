@@ -1,0 +1,91 @@
+"""A smooth (C¹) surface through the nodes of a deformable face: Catmull–Rom, with its derivatives.
+
+Places are in cells of the face's own grid, and move with it: the material points of the body. On a surface of flat
+facets a point that crosses an edge would see the normal jump, and contact would not converge.
+
+Source:
+    Catmull and Rom, A class of local interpolating splines (1974).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+# Coefficients of 1, t, t², t³ in the weight of each of the four nodes around a cell, and of its derivative.
+_WEIGHTS = np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]) / 2
+_SLOPES = np.pad(_WEIGHTS[:, 1:] * np.arange(1, 4), [(0, 0), (0, 1)])
+# How far beyond its rim the surface is continued, in cells: more than half of what a point of a face stands for.
+BEYOND = 0.5
+
+Place = Float[Array, "2 *points"]
+
+
+class SurfacePoint(NamedTuple):
+    """Positions [mm] of points of the surface, and their derivatives by place [mm per cell]."""
+
+    position: Float[Array, "3 *points"]
+    along_x: Float[Array, "3 *points"]
+    along_y: Float[Array, "3 *points"]
+
+    def step_towards(self, xy: Float[Array, "2 *points"]) -> Place:
+        """Compute the Newton step of places towards x and y [mm]; none where the surface is folded."""
+        off = xy - self.position[:2]
+        (a, c), (b, d) = self.along_x[:2], self.along_y[:2]
+        determinant = a * d - b * c
+        step = jnp.stack([d * off[0] - b * off[1], a * off[1] - c * off[0]])
+        return jnp.where(determinant > 0, step / jnp.where(determinant > 0, determinant, 1.0), 0.0)
+
+    @property
+    def slope(self) -> Float[Array, "2 *points"]:
+        """Slope of the surface along x and y [-]."""
+        (a, c), (b, d) = self.along_x[:2], self.along_y[:2]
+        determinant = a * d - b * c
+        up = jnp.stack([d * self.along_x[2] - c * self.along_y[2], a * self.along_y[2] - b * self.along_x[2]])
+        return up / jnp.where(determinant > 0, determinant, 1.0)
+
+
+class Patch(NamedTuple):
+    """The nodes around points, `(3, 4 y, 4 x, *points)` [mm], and the cells that the points are in, x then y."""
+
+    nodes: Float[Array, "3 4 4 *points"]
+    cell: Int[Array, "2 *points"]
+
+    def at(self, place: Place) -> SurfacePoint:
+        """Evaluate the surface; points may be a little outside their cells."""
+        (x, y), (by_x, by_y) = (_weights(place - self.cell, basis) for basis in (_WEIGHTS, _SLOPES))
+        rows, rising = (_sum(weights, self.nodes, 2) for weights in (x, by_x))
+        return SurfacePoint(_sum(y, rows, 1), _sum(y, rising, 1), _sum(by_y, rows, 1))
+
+
+def patch(nodes: Float[Array, "3 my mx"], place: Place) -> Patch:
+    """Collect the nodes [mm] around places."""
+    my, mx = nodes.shape[1:]
+    cell = jnp.stack([jnp.clip(jnp.floor(at), 0, n - 2) for at, n in zip(place, (mx, my), strict=True)]).astype(int)
+    around = np.arange(4).reshape(4, *[1] * (place.ndim - 1))
+    rows, columns = cell[1] + around, cell[0] + around
+    whole = _with_ghosts(_with_ghosts(nodes, 1), 2)
+    return Patch(whole[:, rows[:, None], columns], cell)
+
+
+def _with_ghosts(nodes: Array, axis: int) -> Array:
+    """Continue a row of nodes by one at both ends, with its curvature where it has any."""
+    n = nodes.shape[axis]
+
+    def ghost(first, step):
+        a, b, c = (jnp.take(nodes, jnp.array([first + k * step]), axis=axis) for k in (0, 1, 2 if n > 2 else 1))
+        return 3.0 * a - 3.0 * b + c if n > 2 else 2.0 * a - b
+
+    return jnp.concatenate([ghost(0, 1), nodes, ghost(n - 1, -1)], axis=axis)
+
+
+def _weights(t: Float[Array, "2 *points"], basis: np.ndarray) -> Float[Array, "2 4 *points"]:
+    powers = jnp.stack([jnp.ones_like(t), t, t * t, t * t * t])
+    return jnp.moveaxis(jnp.tensordot(jnp.asarray(basis, t.dtype), powers, 1), 1, 0)
+
+
+def _sum(weights: Float[Array, "4 *points"], values: Array, axis: int) -> Array:
+    """Sum four values along an axis, by weights of the points."""
+    parts = [weights[k] * jnp.take(values, k, axis=axis) for k in range(4)]
+    return parts[0] + parts[1] + parts[2] + parts[3]

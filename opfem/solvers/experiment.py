@@ -1,0 +1,136 @@
+"""From an experiment and its compression to the discrete problem: a layer and a sample in contact."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..mechanics.boundary import Bodies
+from ..mechanics.contact_body import RigidPlate, RigidSurface
+from ..mechanics.contact_pair import SOFT, ContactPair
+from ..mechanics.face import FaceRule
+from ..mechanics.interaction import ContactFace
+from ..mechanics.internal import layer_body, typical
+from ..model import AbstractMaterial, BlockMesh, Bonded, Compression, Contact, Experiment, LayerMesh, Roller, Side
+from .equilibrium import Problem
+from .stack import Stack
+from .supports import Supports, drift_modes
+from .tangent import VOLUME_GUARD
+
+_KINDS = {Bonded: "bonded", Roller: "roller", Contact: "contact"}
+_PLATE_KINDS = {Bonded: "bonded", Roller: "uz", Contact: "contact"}
+
+
+def discretise_experiment(
+    experiment: Experiment, load: Compression, start: Compression | None, rule: FaceRule
+) -> Stack:
+    """Build the discrete problem of a layer and a sample in contact.
+
+    Args:
+        experiment: The experiment.
+        load: Its compression at load fraction 1.
+        start: That at load fraction 0; None for bodies that just touch.
+        rule: Where contact is integrated.
+    """
+    lower, upper = experiment.layer_mesh(), experiment.sample_mesh()
+    soft, material = experiment.layer.material, experiment.sample_material()
+    approach = jnp.zeros_like(load.approach) if start is None else start.approach
+    plate = RigidPlate(experiment.plate_height - approach, experiment.plate_height - load.approach)
+    window = _face(experiment.window, RigidSurface(None, None), False, lower, soft, rule)
+    pressed = _face(experiment.plate, plate, True, upper, material, rule)
+    layer_form, sample_form = experiment.element
+    held = experiment.hold is not None
+    layer = _body(
+        experiment,
+        lower,
+        soft,
+        layer_form,
+        Supports(_KINDS[type(experiment.window)], "contact", experiment.sides, held),
+        Bodies(window, None),
+        None,
+    )
+    move = None
+    if not isinstance(experiment.plate, Contact):
+        top = jnp.ones_like(upper.heights[-1])
+        move = (-approach * top, -load.approach * top)
+    sample = _body(
+        experiment,
+        upper,
+        material,
+        sample_form,
+        Supports("contact", _PLATE_KINDS[type(experiment.plate)], experiment.sides, held),
+        Bodies(None, pressed),
+        move,
+    )
+    exact = isinstance(experiment.interface, Contact) and experiment.interface.law.exact
+    # The sample's face is curved, and gives way: more conditions than the layer's face has nodes could not all be met.
+    face = _face(experiment.interface, RigidSurface(None, None), True, lower, soft, "nodes" if exact else rule)
+    assert face is not None
+    between = 1.0 / (1.0 / face.stiffness + 1.0 / _stiffness(upper, material))
+    pair = ContactPair(
+        face=dataclasses.replace(face, stiffness=between),
+        spacing=jnp.stack(upper.spacing),
+        lower_spacing=jnp.stack(lower.spacing),
+        soft=SOFT * soft.shear,
+        rims=tuple(side == "free" for side in experiment.sides),
+    )
+    return Stack(layer, sample, pair, jnp.zeros((), layer.positions.dtype))
+
+
+def _body(
+    experiment: Experiment,
+    mesh: LayerMesh | BlockMesh,
+    material: AbstractMaterial,
+    element: str,
+    supports: Supports,
+    contacts: Bodies,
+    imposed: tuple[Array, Array] | None,
+) -> Problem:
+    X = mesh.positions()
+    spring = None
+    if experiment.hold is not None:
+        nodes = X[0, 0].size
+        spring = jnp.broadcast_to(experiment.hold / nodes, X.shape[2:])
+    return Problem(
+        body=layer_body(mesh, material, element),
+        low_order=None,
+        positions=X,
+        contacts=contacts,
+        dead=None,
+        imposed=imposed,
+        spring=spring,
+        viscosity=jnp.zeros((), X.dtype),
+        drift_modes=drift_modes(X, supports),
+        supports=supports,
+    )
+
+
+def _face(
+    side: Side,
+    surface: RigidSurface | RigidPlate,
+    above: bool,
+    mesh: LayerMesh | BlockMesh,
+    material: AbstractMaterial,
+    rule: FaceRule,
+) -> ContactFace | None:
+    """Build the contact of a face, which starts where its law has no pressure yet; None where it is held otherwise."""
+    if not isinstance(side, Contact):
+        return None
+    return ContactFace(
+        contact=side,
+        surface=surface,
+        offset=side.law.zero_pressure_clearance,
+        imposed=None,
+        element_size=mesh.element_size,
+        stiffness=_stiffness(mesh, material),
+        above=above,
+        rule=rule,
+    )
+
+
+def _stiffness(mesh: LayerMesh | BlockMesh, material: AbstractMaterial) -> Array:
+    """Compute the stiffness of an element per area [MPa/mm], the scale of hard contact (`discretise`)."""
+    bulk = jnp.minimum(material.bulk, VOLUME_GUARD * material.shear)
+    height = jnp.mean(mesh.thickness) / mesh.layers
+    flatness = jnp.minimum(1.0, height / mesh.element_size)
+    return flatness**2 * typical(jnp.asarray(bulk + 4.0 / 3.0 * material.shear)) / height
