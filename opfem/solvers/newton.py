@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._checks import check_positive
-from ..mechanics.contact_state import ContactIterate, FacePoints
+from ..mechanics.contact_state import ContactIterate
 from ..mechanics.face import FaceRule
 from .equations import AbstractProblem, State
 from .krylov import KrylovResult, fgmres
@@ -107,9 +107,9 @@ class _Iterate(NamedTuple):
 
     x: Unknowns
     direction: Unknowns
-    contact: tuple[ContactIterate, ...]
+    contact: tuple  # of ContactIterate
     forces: Any  # at x, as points, size and tolerance
-    points: tuple[FacePoints, ...]
+    points: tuple
     size: Array
     tolerance: Array
     steps: Array
@@ -156,7 +156,7 @@ def solve_increment(
         hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
-            contact=tuple(contact.after(length) for contact in it.contact),
+            contact=jax.tree.map(lambda c: c.after(length), it.contact, is_leaf=lambda c: isinstance(c, ContactIterate)),
             forces=forces,
             points=points,
             size=size,
