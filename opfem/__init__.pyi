@@ -54,9 +54,14 @@ from .measurement.oct import (
 )
 from .model import (
     Bonded as Bonded,
+    Box as Box,
+    Compression as Compression,
     Contact as Contact,
+    Cylinder as Cylinder,
     Displacement as Displacement,
+    Experiment as Experiment,
     ExponentialOverclosure as ExponentialOverclosure,
+    HalfSpace as HalfSpace,
     HardOverclosure as HardOverclosure,
     Hencky as Hencky,
     Imprint as Imprint,
@@ -67,6 +72,8 @@ from .model import (
     Ogden as Ogden,
     Palpation as Palpation,
     Roller as Roller,
+    Sample as Sample,
+    Sphere as Sphere,
     TabularOverclosure as TabularOverclosure,
     Traction as Traction,
     Yeoh as Yeoh,

@@ -1,4 +1,4 @@
-"""Loads: what the sample does to the layer at the interface."""
+"""Loads: what the sample does to the layer at the interface, or the plate of a virtual experiment to both."""
 
 from typing import Any, Literal
 
@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import Leaf, check_finite, check_non_negative, concrete
+from .._checks import Leaf, check_finite, check_non_negative, check_positive, concrete
 from .._repr import with_units
 from ..measurement import ThicknessMap
 from .surface import INTERPOLATIONS, Interpolation
@@ -110,6 +110,25 @@ class Displacement(eqx.Module):
             raise ValueError(f"Displacement.uz [mm] must be a number or (ny+1, nx+1), got shape {self.uz.shape}.")
         if self.lateral not in ("free", "fixed"):
             raise ValueError(f'Displacement.lateral must be "free" or "fixed", got {self.lateral!r}.')
+
+    def __pdoc__(self, **options: Any) -> Any:
+        return with_units(self, **options)
+
+
+class Compression(eqx.Module):
+    """Press layer and sample together: the plate of an `Experiment` approaches the window.
+
+    Args:
+        approach: How far the plate moves along z [mm], from where the bodies just touch; positive.
+
+    Raises:
+        ValueError: If it is not positive.
+    """
+
+    approach: Array = eqx.field(converter=Leaf("Compression.approach", "mm"))
+
+    def __check_init__(self):
+        check_positive("Compression.approach", "mm", self.approach)
 
     def __pdoc__(self, **options: Any) -> Any:
         return with_units(self, **options)

@@ -97,7 +97,7 @@ class Palpation(eqx.Module):
         self.elements = counts
         self.window = window
         self.sample = sample
-        self.sides = _sides(sides)
+        self.sides = named_sides("Palpation", sides)
         self.element = element
         self.hold = hold
 
@@ -111,7 +111,16 @@ class Palpation(eqx.Module):
         return LayerMesh(self.layer.thickness_at(*flat.plane()), self.extent, nz)
 
 
-def _sides(sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, str, str]:
+def named_sides(owner: str, sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, str, str]:
+    """Return what holds each side, in the order of `SIDES`.
+
+    Args:
+        owner: Whose sides they are, for messages.
+        sides: As `Palpation` takes them.
+
+    Raises:
+        ValueError: If they are none of these.
+    """
     if isinstance(sides, str):
         chosen = (sides,) * len(SIDES)
     elif isinstance(sides, Mapping) and set(sides) <= set(SIDES):
@@ -120,7 +129,7 @@ def _sides(sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, 
         chosen = tuple(sides)
     if len(chosen) != len(SIDES) or not set(chosen) <= {"free", "roller"}:
         raise ValueError(
-            f'Palpation.sides must be "free", "roller", a dict of these by {SIDES} or one for each of them, '
+            f'{owner}.sides must be "free", "roller", a dict of these by {SIDES} or one for each of them, '
             f"got {sides!r}."
         )
     x0, x1, y0, y1 = chosen

@@ -45,7 +45,23 @@ def check_clearance_unit(field: str, value: Any) -> None:
         )
 
 
-def check_unloaded(thickness: Any) -> None:
+def check_approach(approach: Any, height: Any) -> None:
+    """Refuse an approach of the plate [mm] beyond what layer and sample can be pressed to.
+
+    Args:
+        approach: Of the plate.
+        height: Between window and plate before [mm].
+    """
+    known, room = concrete(approach), concrete(height)
+    if known is None or room is None or known.ndim or room.ndim or known <= (1.0 - _CRUSHED) * room:
+        return
+    raise ValueError(
+        f"Compression.approach [mm] must be at most {1.0 - _CRUSHED:.0%} of the {room:.4g} mm between window and "
+        f"plate, got {known:.4g}{': the plate would pass the window' if known >= room else ''}. Is it in mm?"
+    )
+
+
+def check_unloaded(thickness: Any, field: str = "Layer.thickness") -> None:
     """Refuse an unloaded thickness [mm], a number or a map, that looks like one in µm or m."""
     if isinstance(thickness, ThicknessMap):
         known = _known(thickness)
@@ -58,8 +74,7 @@ def check_unloaded(thickness: Any) -> None:
     if high < THINNEST or low > THICKEST:
         guess = "m? Multiply by 1e3." if high < THINNEST else "µm? Multiply by 1e-3."
         raise ValueError(
-            f"Layer.thickness [mm] must lie between {THINNEST:g} and {THICKEST:g}, got {_written(low, high)}; is it in "
-            f"{guess}"
+            f"{field} [mm] must lie between {THINNEST:g} and {THICKEST:g}, got {_written(low, high)}; is it in {guess}"
         )
 
 
