@@ -22,7 +22,7 @@ from .contact_state import ContactIterate, Corners, FacePoints, PointContact, Sl
 from .face import CORNERS, area_vector, quadrature, size, surface_tangents, to_corners
 from .interaction import ContactFace, positive_part
 from .kinematics import contract
-from .smooth_face import BEYOND, Place, patch
+from .smooth_face import BEYOND, Place, continued, mirrored, patch
 
 # Newton steps to find the place of a point, from where it would be had the upper face not moved.
 _FINDING_STEPS = 6
@@ -83,12 +83,13 @@ class ContactPair(eqx.Module):
         The search has no derivative; two Newton steps after it carry them, one order each.
         """
         position, *tangents = surface_tangents(x, self.face.rule)
-        found = self._find(jax.lax.stop_gradient(position[:2]), jax.lax.stop_gradient(upper))
-        around = patch(upper, found)
+        surface = continued(upper, self.rims)
+        found = self._find(jax.lax.stop_gradient(position[:2]), jax.lax.stop_gradient(surface))
+        around = patch(surface, found)
         place = jax.lax.fori_loop(0, 2, lambda _, place: place + around.at(place).step_towards(position[:2]), found)
-        place = jnp.where(self._is_near(found, upper), place, found)
+        place = jnp.where(_is_near(found, surface), place, found)
         met = around.at(place)
-        anchor = patch(upper, history.position).at(history.position).position[:2]
+        anchor = patch(surface, history.position).at(history.position).position[:2]
         at = FacePoints(fraction, position, jnp.stack(tangents), met.position[2], met.slope, None, anchor)
         return PairPoints(at, place, self._overlap(place, upper))
 
@@ -106,7 +107,7 @@ class ContactPair(eqx.Module):
         weights = quadrature(self.face.rule).weights[:, None]
 
         def under(nodes):
-            return patch(nodes, jax.lax.stop_gradient(points.place)).at(points.place).position
+            return patch(mirrored(nodes), jax.lax.stop_gradient(points.place)).at(points.place).position
 
         (onto,) = jax.vjp(under, jnp.zeros_like(upper))[1](density * weights)
         return PairForce(to_corners(jnp.moveaxis(density, 1, 0), self.face.rule), -onto)
@@ -142,11 +143,11 @@ class ContactPair(eqx.Module):
             return k * self.soft / (k + self.soft)
 
         area = self.area(points)
-        soft = positive_part(at.normal, softened(-slope), softened(friction.stiffness), friction) * area
         full = positive_part(at.normal, -slope, friction.stiffness, friction) * area
+        soft = positive_part(at.normal, softened(-slope), softened(friction.stiffness), friction) * area
         q = quadrature(face.rule)
-        lower = contract(np.einsum("q,qa,qb->abq", q.weights, q.N, q.N), jnp.moveaxis(soft, 2, 0))
-        return lower, self._gathered(points.place, full * q.weights[:, None], upper)
+        lower = contract(np.einsum("q,qa,qb->abq", q.weights, q.N, q.N), jnp.moveaxis(full, 2, 0))
+        return lower, self._gathered(points.place, soft * q.weights[:, None], upper)
 
     def tangent_law(
         self, points: PairPoints, history: SlipHistory, iterate: ContactIterate, curvature: Array
@@ -160,7 +161,7 @@ class ContactPair(eqx.Module):
         """Compute what the next iteration remembers once a part of the step of both faces is taken."""
         at = points.at
         step = jnp.moveaxis(contract(quadrature(self.face.rule).N, change), 1, 0)
-        apart = patch(upper, points.place).at(points.place).position - step
+        apart = patch(continued(upper, self.rims), points.place).at(points.place).position - step
         opening = apart[2] - at.slope[0] * apart[0] - at.slope[1] * apart[1]
         clearance = self.face.clearance(at) + opening / at.stretch
         point = self.at_points(points, history, law)
@@ -176,21 +177,11 @@ class ContactPair(eqx.Module):
     def _unmoved(self, xy: Float[Array, "2 *points"]) -> Place:
         return xy / self.spacing.reshape(2, *[1] * (xy.ndim - 1))
 
-    def _find(self, xy: Float[Array, "2 *points"], upper: UpperNodes) -> Place:
+    def _find(self, xy: Float[Array, "2 *points"], surface: Array) -> Place:
         def closer(_, place):
-            return self._clipped(place + patch(upper, place).at(place).step_towards(xy), upper)
+            return _clipped(place + patch(surface, place).at(place).step_towards(xy), surface)
 
-        return jax.lax.fori_loop(0, _FINDING_STEPS, closer, self._clipped(self._unmoved(xy), upper))
-
-    def _clipped(self, place: Place, upper: UpperNodes) -> Place:
-        return jnp.clip(place, -BEYOND, self._last(place, upper) + BEYOND)
-
-    def _is_near(self, place: Place, upper: UpperNodes) -> Array:
-        """Tell whether the search ended on the upper face, or just beside it."""
-        return jnp.all((place > -BEYOND) & (place < self._last(place, upper) + BEYOND), axis=0)
-
-    def _last(self, place: Place, upper: UpperNodes) -> np.ndarray:
-        return np.array(upper.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 1.0
+        return jax.lax.fori_loop(0, _FINDING_STEPS, closer, _clipped(self._unmoved(xy), surface))
 
     def _overlap(self, place: Place, upper: UpperNodes) -> Float[Array, "points *faces"]:
         """Compute the share of each point that the upper face reaches over.
@@ -214,10 +205,23 @@ class ContactPair(eqx.Module):
     ) -> Float[Array, "4 4 3 3 upper_faces"]:
         """Add the springs of points into the matrices of the upper body's faces, bilinear within them."""
         my, mx = upper.shape[1:]
-        cell = patch(upper, place).cell
+        cell = patch(mirrored(upper), place).cell
         x, y = jnp.clip(place - cell, 0.0, 1.0)
         weights = jnp.stack([(x if i else 1.0 - x) * (y if j else 1.0 - y) for i, j in CORNERS])
         each = weights[:, None, None, None] * weights[None, :, None, None] * springs
         index = (cell[1] * (mx - 1) + cell[0]).reshape(-1)
         whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), springs.dtype)
         return whole.at[..., index].add(each.reshape(4, 4, 3, 3, -1))
+
+
+def _clipped(place: Place, surface: Array) -> Place:
+    return jnp.clip(place, -BEYOND, _last(place, surface) + BEYOND)
+
+
+def _is_near(place: Place, surface: Array) -> Array:
+    """Tell whether a search ended on the upper face, or just beside it."""
+    return jnp.all((place > -BEYOND) & (place < _last(place, surface) + BEYOND), axis=0)
+
+
+def _last(place: Place, surface: Array) -> np.ndarray:
+    return np.array(surface.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 3.0

@@ -59,25 +59,40 @@ class Patch(NamedTuple):
         return SurfacePoint(_sum(y, rows, 1), _sum(y, rising, 1), _sum(by_y, rows, 1))
 
 
-def patch(nodes: Float[Array, "3 my mx"], place: Place) -> Patch:
-    """Collect the nodes [mm] around places."""
-    my, mx = nodes.shape[1:]
+def patch(whole: Float[Array, "3 wy wx"], place: Place) -> Patch:
+    """Collect the nodes [mm] around places, of a face that is `continued` or `mirrored`."""
+    my, mx = (n - 2 for n in whole.shape[1:])
     cell = jnp.stack([jnp.clip(jnp.floor(at), 0, n - 2) for at, n in zip(place, (mx, my), strict=True)]).astype(int)
     around = np.arange(4).reshape(4, *[1] * (place.ndim - 1))
     rows, columns = cell[1] + around, cell[0] + around
-    whole = _with_ghosts(_with_ghosts(nodes, 1), 2)
     return Patch(whole[:, rows[:, None], columns], cell)
 
 
-def _with_ghosts(nodes: Array, axis: int) -> Array:
-    """Continue a row of nodes by one at both ends, with its curvature where it has any."""
-    n = nodes.shape[axis]
+def continued(nodes: Float[Array, "3 my mx"], rims: tuple[bool, bool, bool, bool]) -> Float[Array, "3 wy wx"]:
+    """Continue a face by one node on each side: with its curvature beyond a rim, as its mirror image elsewhere.
 
-    def ghost(first, step):
-        a, b, c = (jnp.take(nodes, jnp.array([first + k * step]), axis=axis) for k in (0, 1, 2 if n > 2 else 1))
-        return 3.0 * a - 3.0 * b + c if n > 2 else 2.0 * a - b
+    Args:
+        nodes: Of the face [mm].
+        rims: Whether the face ends at x0, x1, y0, y1; else there is a plane of symmetry.
+    """
+    for axis, ends in ((2, rims[:2]), (1, rims[2:])):
+        odd = np.zeros((3, 1, 1))
+        odd[2 - axis] = 1.0  # the coordinate across the plane
 
-    return jnp.concatenate([ghost(0, 1), nodes, ghost(n - 1, -1)], axis=axis)
+        def ghost(row, is_rim, axis=axis, odd=odd):
+            a, b, *more = row[:3]
+            if is_rim:
+                return 3.0 * a - 3.0 * b + more[0] if more else 2.0 * a - b
+            return odd * (2.0 * a - b) + (1.0 - odd) * b
+
+        rows = jnp.split(nodes, nodes.shape[axis], axis=axis)
+        nodes = jnp.concatenate([ghost(rows, ends[0]), nodes, ghost(rows[::-1], ends[1])], axis=axis)
+    return nodes
+
+
+def mirrored(nodes: Float[Array, "3 my mx"]) -> Float[Array, "3 wy wx"]:
+    """Continue a face by its mirror image: forces so distributed are, of a uniform pressure, those of its elements."""
+    return jnp.pad(nodes, [(0, 0), (1, 1), (1, 1)], mode="reflect")
 
 
 def _weights(t: Float[Array, "2 *points"], basis: np.ndarray) -> Float[Array, "2 4 *points"]:

@@ -156,7 +156,9 @@ def solve_increment(
         hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
-            contact=jax.tree.map(lambda c: c.after(length), it.contact, is_leaf=lambda c: isinstance(c, ContactIterate)),
+            contact=jax.tree.map(
+                lambda c: c.after(length), it.contact, is_leaf=lambda c: isinstance(c, ContactIterate)
+            ),
             forces=forces,
             points=points,
             size=size,

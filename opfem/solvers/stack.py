@@ -210,11 +210,11 @@ class Stack(AbstractProblem):
         between = pair.linearised(single(fraction), corners, upper, history, law)
         if transposed:
             between = _transposed(between, corners, upper)
-        soft, full = pair.guards(at, upper, history, law)
+        full, soft = pair.guards(at, upper, history, law)
         own = [
             body.tangent(v, fraction, before, law, transposed, at, {face: springs}, self.stress_scale)
             for (body, v, before), law, at, face, springs in zip(
-                self._each(x, state), laws[:2], points[:2], ("sample", "window"), (soft, full), strict=True
+                self._each(x, state), laws[:2], points[:2], ("sample", "window"), (full, soft), strict=True
             )
         ]
         return StackTangent((own[0], own[1]), between, transposed)
@@ -274,12 +274,12 @@ class StackTangent(NamedTuple):
         """Apply one V-cycle to each body: the upper one first, the other way round where transposed."""
         lower, upper = _split(r)
         if self.is_transposed:
-            below = self.bodies[0].precondition(lower)
-            pushed = self._between(below.u, jnp.zeros_like(upper.u, jnp.float32))[1]
-            return _together([below, self.bodies[1].precondition(upper._replace(u=upper.u + pushed))])
-        above = self.bodies[1].precondition(upper)
-        pushed = self._between(jnp.zeros_like(lower.u, jnp.float32), above.u)[0]
-        return _together([self.bodies[0].precondition(lower._replace(u=lower.u + pushed)), above])
+            above = self.bodies[1].precondition(upper)
+            pushed = self._between(jnp.zeros_like(lower.u, jnp.float32), above.u)[0]
+            return _together([self.bodies[0].precondition(lower._replace(u=lower.u + pushed)), above])
+        below = self.bodies[0].precondition(lower)
+        pushed = self._between(below.u, jnp.zeros_like(upper.u, jnp.float32))[1]
+        return _together([below, self.bodies[1].precondition(upper._replace(u=upper.u + pushed))])
 
     def _between(self, lower: Nodal, upper: Nodal) -> tuple[Nodal, Nodal]:
         """Compute how forces of contact between the bodies change with their motion."""
