@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..model import AbstractMaterial, LayerMesh
+from ..model import AbstractMaterial, BlockMesh, LayerMesh
 from ..model.deformation import Kinematics, ProductSum, identity_like, kinematics
 from .kinematics import AbstractCells, LayerCells, layer_cells
 
@@ -244,7 +244,7 @@ class LayerBody(SolidBody):
     cells: LayerCells
 
 
-def layer_body(mesh: LayerMesh, material: AbstractMaterial, element: str) -> LayerBody:
+def layer_body(mesh: LayerMesh | BlockMesh, material: AbstractMaterial, element: str) -> LayerBody:
     """Build the deformable layer.
 
     Args:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..model import LayerMesh
+from ..model import BlockMesh, LayerMesh
 from ..model.deformation import ProductSum
 from .hex8 import CORNERS, GAUSS_POINTS, GRADIENTS, assemble, gather
 from .staging import apart
@@ -273,14 +273,14 @@ class LayerCells(AbstractCells):
         return jnp.stack([x, y, z / self.depth - self.slope_x * x - self.slope_y * y], axis=axis)
 
 
-def layer_cells(mesh: LayerMesh, name: str = "hex8") -> LayerCells:
+def layer_cells(mesh: LayerMesh | BlockMesh, name: str = "hex8") -> LayerCells:
     """Compute the inverse map of every cell of the mesh at its points.
 
     Args:
         mesh: The mesh.
         name: "hex8", "tet4", or "tet10" for cells of 2 × 2 × 2 elements.
     """
-    if name != "hex8":
+    if name != "hex8" or isinstance(mesh, BlockMesh):
         return _from_positions(mesh, name)
     nz = mesh.layers
     L0 = mesh.thickness
@@ -300,10 +300,10 @@ def layer_cells(mesh: LayerMesh, name: str = "hex8") -> LayerCells:
     )
 
 
-def _from_positions(mesh: LayerMesh, name: str) -> LayerCells:
+def _from_positions(mesh: LayerMesh | BlockMesh, name: str) -> LayerCells:
     """Take the map's gradient from the nodes: isoparametric."""
     spacing = jnp.stack(mesh.spacing) * CELLS[name].span
-    one = jnp.ones((1, 1, 1, 1), mesh.thickness.dtype)
+    one = jnp.ones((1, 1, 1, 1), mesh.extent.dtype)
     gather = LayerCells(spacing, one, one, one, name).gather
     dZ = contract(CELLS[name].gradients, gather(mesh.positions()[2:]))[:, :, 0]
     return LayerCells(spacing, dZ[:, 2], dZ[:, 0] / dZ[:, 2], dZ[:, 1] / dZ[:, 2], name)
