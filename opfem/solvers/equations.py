@@ -167,6 +167,10 @@ class AbstractProblem(eqx.Module):
         """Compare what the hold carries of each body with what friction could, and with the normal force."""
         raise NotImplementedError
 
+    def without_drift(self, u: PyTree, held: Array) -> PyTree:
+        """Move bodies as a whole so that they have none of the held rigid motions where these are held."""
+        raise NotImplementedError
+
     def with_imposed(self, u: PyTree, fraction: Array) -> PyTree:
         """Set the prescribed displacements."""
         raise NotImplementedError

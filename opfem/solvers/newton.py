@@ -243,13 +243,16 @@ def solve_tangent(
         return inside(tangent.apply(v))
 
     def precondition(v):
-        return inside(tangent.precondition(v))
+        # The hold acts on the window face, but what it prevents is motion of the whole body.
+        x = tangent.precondition(v)
+        return x._replace(u=problem.without_drift(x.u, held))
 
     start = b
     if transposed and preconditioned is None:
         start = precondition(b)
     elif transposed:
-        start = inside(jax.tree.map(lambda part: (part / size).astype(jnp.float32), preconditioned))
+        start = jax.tree.map(lambda part: (part / size).astype(jnp.float32), preconditioned)
+        start = start._replace(u=problem.without_drift(start.u, held))
     result = fgmres(
         (lambda v: precondition(multiply(v))) if transposed else multiply,
         (lambda v: v) if transposed else precondition,

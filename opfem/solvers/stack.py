@@ -1,8 +1,8 @@
 """Two deformable bodies on top of each other, each with its rigid surfaces, in contact: the discrete problem.
 
-The linear systems of a stack are preconditioned body by body (block Gauss–Seidel): the upper one with all
-of its contact springs, then the lower one almost without. Columns through both bodies would be spoilt as soon as the
-bodies slide.
+The linear systems of a stack are preconditioned body by body (block Gauss–Seidel): the lower one with all of its
+contact springs, which stand at its own face points and so are exact there, then the upper one almost without. Columns
+through both bodies would be spoilt as soon as the bodies slide.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,6 +23,11 @@ from .tangent import Tangent, Unknowns
 # A first guess closes every contact to this share of the lower body's shear modulus: enough for laws that start without
 # stiffness to have some, too little to deform anything.
 _TOUCH = 1e-3
+
+# V-cycles of the lower body for one of the upper one. What is left of stiff contact after one would count against the
+# upper body's soft springs: on 12×12×(2+6) elements with the exponential law and friction 0.05, one, three with
+# friction's coupling left out, and three with it take 96, 77 and 24 iterations a Newton step.
+_LOWER_CYCLES = 3
 
 
 class StackForces(NamedTuple):
@@ -151,6 +156,10 @@ class Stack(AbstractProblem):
         """Take the held rigid motions of each body out of nodal fields."""
         return tuple(body.project(v, held) for body, v in zip(self.bodies, r, strict=True))
 
+    def without_drift(self, u: PyTree, held: Array) -> PyTree:
+        """Move each body as a whole so that its lower face has none of the held rigid motions."""
+        return tuple(body.without_drift(v, held) for body, v in zip(self.bodies, u, strict=True))
+
     def limited(self, change: PyTree, step_limit: float | int | Array) -> PyTree:
         """Shorten the moves of single nodes that stand out of a step."""
         return tuple(body.limited(v, step_limit) for body, v in zip(self.bodies, change, strict=True))
@@ -217,7 +226,7 @@ class Stack(AbstractProblem):
                 self._each(x, state), laws[:2], points[:2], ("sample", "window"), (full, soft), strict=True
             )
         ]
-        return StackTangent((own[0], own[1]), between, transposed)
+        return StackTangent((own[0], own[1]), between, transposed, self.upper.elements)
 
     def initial_state(self) -> State:
         """Build the undeformed state at load fraction zero."""
@@ -258,11 +267,13 @@ class StackTangent(NamedTuple):
         between: Change of the forces of contact between them by the motion of the lower face's corners and of the upper
             face's nodes; transposed where the operator is.
         is_transposed: Whether it is.
+        upper_elements: Elements (nz, ny, nx) of the upper body.
     """
 
     bodies: tuple[Tangent, Tangent]
     between: Callable[[Array, Array], PairForce]
     is_transposed: bool
+    upper_elements: tuple[int, int, int]
 
     def apply(self, x: Unknowns) -> Unknowns:
         """Multiply with unknowns."""
@@ -271,15 +282,27 @@ class StackTangent(NamedTuple):
         return _together([f._replace(u=f.u - push) for f, push in zip(own, pushed, strict=True)])
 
     def precondition(self, r: Unknowns) -> Unknowns:
-        """Apply one V-cycle to each body: the upper one first, the other way round where transposed."""
+        """Solve the lower body, then the upper one with what that pushes; the other way round where transposed."""
         lower, upper = _split(r)
         if self.is_transposed:
             above = self.bodies[1].precondition(upper)
             pushed = self._between(jnp.zeros_like(lower.u, jnp.float32), above.u)[0]
-            return _together([self.bodies[0].precondition(lower._replace(u=lower.u + pushed)), above])
-        below = self.bodies[0].precondition(lower)
+            return _together([self._solve_lower(lower._replace(u=lower.u + pushed)), above])
+        below = self._solve_lower(lower)
         pushed = self._between(below.u, jnp.zeros_like(upper.u, jnp.float32))[1]
         return _together([below, self.bodies[1].precondition(upper._replace(u=upper.u + pushed))])
+
+    def _solve_lower(self, r: Unknowns) -> Unknowns:
+        """Solve the lower body against a fixed upper one, friction's coupling included, by V-cycles."""
+        body, r = self.bodies[0], jax.tree.map(lambda part: part.astype(jnp.float32), r)
+        still = jnp.zeros((3, *(n + 1 for n in self.upper_elements)), jnp.float32)
+
+        def improve(_, x):
+            own = body.apply(x)
+            rest = own._replace(u=own.u - self._between(x.u, still)[0])
+            return jax.tree.map(jnp.add, x, body.precondition(jax.tree.map(jnp.subtract, r, rest)))
+
+        return jax.lax.fori_loop(0, _LOWER_CYCLES, improve, jax.tree.map(jnp.zeros_like, r))
 
     def _between(self, lower: Nodal, upper: Nodal) -> tuple[Nodal, Nodal]:
         """Compute how forces of contact between the bodies change with their motion."""
