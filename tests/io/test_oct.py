@@ -270,6 +270,91 @@ def test_linear_power_is_written_as_decibels(tmp_path):
     np.testing.assert_allclose(read.intensity(), written.values, rtol=1e-5)  # float32 of 16 dB
 
 
+def spectra(repeats=(1, 1), is_ascending=False):
+    """Whole counts of random scenes, on a chirped spectrometer of an odd number of pixels."""
+    rng = np.random.default_rng(4)
+    pixels = 45
+    even = np.linspace(0.0, 1.0, pixels)
+    reference = 2e4 * np.exp(-(((even - 0.45) / 0.3) ** 2)) + 0.3
+    counts = rng.integers(200, 60_000, (2 * repeats[0], 3 * repeats[1], pixels)).astype(np.uint16)
+    return op.Spectra(
+        counts, (0.01, 0.02), 5e-3, reference=reference, offset=100.0 + 10.0 * even,
+        chirp=(pixels - 1) * (even + 0.1 * even * (1 - even)), origin=(0.1, 0.2), wavelength=845e-6,
+        dispersion=(3.0, -1.5), is_ascending=is_ascending, repeats=repeats,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".oct"])
+@pytest.mark.parametrize("repeats", [(1, 1), (2, 3)])
+def test_written_spectra_come_back(tmp_path, suffix, repeats):
+    written = spectra(repeats)
+    op.write_oct(written, tmp_path / f"a{suffix}")
+    read = op.read_spectra(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(read.values, written.values)
+    # Thorlabs' files hold float32, and the reference as whole counts of 25 lines.
+    coarse = suffix == ".oct"
+    np.testing.assert_allclose(read.reference, written.reference, atol=0.02 if coarse else 0.0)
+    for name in ("offset", "chirp"):
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=1e-6 if coarse else 0.0)
+    for name in ("spacing", "origin", "optical_spacing", "wavelength", "dispersion"):
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=ROUNDOFF)
+    assert (read.repeats, read.is_ascending, read.shape) == (repeats, False, (2, 3, 45))
+    volume, direct = op.read_oct(tmp_path / f"a{suffix}"), written.to_volume()
+    assert volume.scale == ("complex" if repeats == (1, 1) else "linear")
+    np.testing.assert_allclose(volume.values, direct.values, atol=1e-4 * np.abs(direct.values).max())
+
+
+def test_ascending_spectra_are_turned_round(tmp_path):
+    written = spectra(is_ascending=True)
+    op.write_oct(written, tmp_path / "a.oct")
+    op.write_oct(written, tmp_path / "a.h5")
+    turned, kept = op.read_oct(tmp_path / "a.oct"), op.read_oct(tmp_path / "a.h5")
+    assert (turned.phase_sign, kept.phase_sign) == (-1, 1)
+    top = np.abs(kept.values).max()
+    np.testing.assert_allclose(np.conj(turned.values), kept.values, atol=1e-3 * top)
+
+
+def test_counts_of_electrons_take_four_bytes(tmp_path):
+    few = spectra()
+    many = op.Spectra(
+        540.0 * few.values, few.spacing, few.optical_spacing, reference=540.0 * few.reference, chirp=few.chirp
+    )
+    op.write_oct(many, tmp_path / "a.oct")
+    np.testing.assert_array_equal(op.read_spectra(tmp_path / "a.oct").values, many.values)
+
+
+def test_repeats_in_a_header(tmp_path):
+    """Of one file: repeats that do not divide, all B-scans at one place, and what only the header names."""
+    op.write_oct(spectra((2, 3)), tmp_path / "a.oct")
+
+    def read(change):
+        return op.read_spectra(rewritten(tmp_path / "a.oct", tmp_path / "b.oct", header=change))
+
+    with pytest.raises(op.MeasurementError, match="has 9 A-lines, which averaging over 2 does not divide"):
+        read(lambda header: header.replace("<AScans>3<", "<AScans>2<"))
+    one_place = read(lambda header: re.sub('RangeY="[^"]*"', 'RangeY="-1"', header))
+    assert one_place.repeats == (4, 3)
+    assert one_place.to_volume().shape == (1, 3, 22)
+    speckle = "<SpeckleAveraging><FastAxis>3</FastAxis><SlowAxis>4</SlowAxis></SpeckleAveraging><RefractiveIndex>"
+    averaged = read(
+        lambda header: re.sub(r"<(AScans|BScans)>\d<", r"<\1>1<", header).replace("<RefractiveIndex>", speckle)
+    )
+    assert averaged.repeats == (4, 3)
+
+
+def test_repeated_lines_are_averaged_in_power():
+    """Speckle of a scatterer whose phase is another one each time neither fades nor stays."""
+    pixels, times = 256, 64
+    rng = np.random.default_rng(0)
+    place = np.arange(pixels)
+    turns = np.exp(2j * np.pi * rng.random((1, times, 1)))
+    fringes = (np.exp(2j * np.pi * 40 * place / pixels) * turns).real
+    counts = 1e4 * (1 + 0.1 * np.concatenate([fringes, 2 * fringes], axis=1))
+    read = op.Spectra(counts, 0.01, 5e-3, reference=np.full(pixels, 1e4), repeats=(1, times)).to_volume("none")
+    assert (read.shape, read.scale, read.phase_sign) == ((1, 2, 128), "linear", None)
+    np.testing.assert_allclose(read.values[0, :, 40], [0.05**2, 0.1**2], rtol=1e-5)
+
+
 def test_raw_spectra_of_a_thorlabs_file(tmp_path):
     """Mirrors in two B-scans of raw spectra, with apodisation lines, offset and chirp, come back at their depths."""
     pixels, lines = 1024, 3

@@ -43,8 +43,8 @@ def spectrometer_of(system: OctSystem, dz: float, levels: int) -> Spectrometer:
         raise ValueError(
             f"simulate_oct.depth_spacing [mm] of {dz:g} needs wavelengths of more than one octave; take a larger one."
         )
-    ends = 2.0 * math.pi / (middle + step * np.array([centre, -centre]))
-    k = 2.0 * math.pi / np.linspace(*ends, pixels)
+    shortest, longest = (2.0 * math.pi / (middle + way * step * centre) for way in (1.0, -1.0))
+    k = 2.0 * math.pi / np.linspace(shortest, longest, pixels)
     chirp = (k[0] - k) / (k[0] - k[-1]) * (pixels - 1)
     # The spectrum of light is the Fourier transform of the axial point spread function.
     field_std = 0.5 / math.sqrt(math.log(2.0)) * float(system.axial_fwhm) / dz

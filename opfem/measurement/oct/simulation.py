@@ -223,7 +223,9 @@ class _Scene:
                 moved = _spread(moved, move / step, axis)
         return moved
 
-    def reflected(self, fields: list[np.ndarray], specular: float | None, lines: Sequence[tuple[float, float]]) -> float:
+    def reflected(
+        self, fields: list[np.ndarray], specular: float | None, lines: Sequence[tuple[float, float]]
+    ) -> float:
         """Add the surface's reflection and lines; return the mean amplitude of the sample at its surface."""
         ny, nx = self.shape
         x, y = np.arange(nx) * self.spacing[0], np.arange(ny) * self.spacing[1]
