@@ -146,8 +146,8 @@ class TractionFit(eqx.Module):
         if self.reduced_chi2 < _CHI2_BOUNDS[0]:
             left = self.observed - self.effective_dof
             smooth = (
-                f" Or the traction is smoother than its prior: {left:.0f} of {self.observed:.0f} degrees of freedom are "
-                "left, the shortest waves, where noise that is correlated over pixels has less power than is assumed."
+                f" Or the traction is smoother than its prior: {left:.0f} of {self.observed:.0f} degrees of freedom "
+                "are left, the shortest waves, where noise that is correlated over pixels has less power than assumed."
             )
             return (
                 f"χ² per degree of freedom is {self.reduced_chi2:.3g} and should be near 1: the noise given (std or "

@@ -52,8 +52,9 @@ def read_oct(
 ) -> OctVolume:
     """Read an OCT volume.
 
-    Read are ThorImage's .oct and the folder it unpacks to, files of `write_oct`, TIFF stacks, HDF5 and MATLAB files,
-    .npy, and raw numbers. Volumes that are not compressed stay in the file.
+    Read are ThorImage's .oct and the folder it unpacks to, files of `write_oct`, TIFF stacks (those of myOCT are
+    decoded), HDF5 and MATLAB files, .npy, and raw numbers. Volumes that are not compressed stay in the file. Raw
+    spectra are transformed; repeated A-lines and B-scans become their mean power.
 
     Args:
         path: File, or folder that holds a Header.xml.
@@ -94,6 +95,8 @@ def read_oct(
         if found is not None:
             return _restated(found if isinstance(found, OctVolume) else found.to_volume(), scale, own)
         values = ordered(stored.values, order if order or form != "tiff" else "xzy")
+        if "dz" in stored.attributes:
+            return _of_myoct(values, stored.attributes, spacing, depth_spacing, index_applied, own)
         return _stated(values, spacing, depth_spacing, index_applied, scale, own)
 
     volume = guarded(path, read)
@@ -215,6 +218,19 @@ def _stated(values: np.ndarray, spacing, depth_spacing, index_applied, scale, ow
     applied = 1.0 if index_applied is None else index_applied
     step = Step("read", index_applied=applied)
     return OctVolume(values, spacing, depth_spacing * applied, scale, steps=(step,), **own)
+
+
+def _of_myoct(values: np.ndarray, known: dict[str, Any], spacing, depth_spacing, index_applied, own) -> OctVolume:
+    """Make a volume in dB by what myOCT says of its grid, where the caller does not."""
+    if spacing is None and None not in (known["dx"], known["dy"]):
+        spacing = (known["dx"], known["dy"])
+    if depth_spacing is None and known["dz"] is not None:
+        if index_applied is None:
+            raise MeasurementError(
+                "needs index_applied=: myOCT does not state the refractive index it divided depth by."
+            )
+        depth_spacing = known["dz"]
+    return _stated(values, spacing, depth_spacing, index_applied, "db", own)
 
 
 def _guess(values: np.ndarray) -> str:

@@ -15,6 +15,7 @@ import scipy.io
 import tifffile
 
 from ..measurement import MeasurementError
+from .myoct import decoded, myoct_description, spacing_of
 from .thorlabs import LARGEST_UNPACKED
 
 OWN_ATTRIBUTES = (
@@ -143,7 +144,8 @@ def read_mat5(path: Path, variable: str | None) -> Stored:
 
 
 def read_tiff(path: Path) -> Stored:
-    """Read the pages of a TIFF file as one volume: [page, row, column]."""
+    """Read the pages of a TIFF file as one volume: [page, row, column]; of myOCT's with its grid."""
+    attributes: dict[str, Any] = {}
     with tifffile.TiffFile(path) as file:
         if len(file.series) > 1 and all(series.shape == file.series[0].shape for series in file.series):
             shape = (len(file.series), *file.series[0].shape)
@@ -169,7 +171,12 @@ def read_tiff(path: Path) -> Stored:
         else:
             listed = ", ".join(str(series.shape) for series in file.series[:8])
             raise MeasurementError(f"holds images of several sizes, {listed}; a volume is a stack of one size.")
-    return Stored(values[None] if values.ndim == 2 else values, {}, {})
+        said = myoct_description(file)
+        if said is not None:
+            _check_memory("the stack", 4 * values.size)
+            values = decoded(values, said)
+            attributes = {f"d{axis}": spacing_of(said, axis) for axis in "xyz"}
+    return Stored(values[None] if values.ndim == 2 else values, attributes, {})
 
 
 def ordered(values: np.ndarray, order: str | None) -> np.ndarray:

@@ -1,5 +1,6 @@
 """OCT volumes come back from every kind of file as they were, and what is wrong with a file is said in one line."""
 
+import json
 import re
 import shutil
 import zipfile
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 import tifffile
+from PIL import Image
 
 import opfem as op
 from tests.tolerances import ROUNDOFF
@@ -150,6 +152,45 @@ def test_complex_numbers_as_matlab_stores_them(tmp_path):
     )
     np.testing.assert_array_equal(read.values, values)
     assert read.phase_sign == 1
+
+
+def myoct(path, version=3, dtype=np.uint16, **change):
+    """A stack as myOCT writes it: pages of z by x, its JSON in the first page's tag 305."""
+    ny, nx, nz = SHAPE
+    levels = np.random.default_rng(5).integers(0, 2**16, (ny, nz, nx)).astype(dtype)
+    levels[0, 0, 0] = 0
+    grid = {axis: {"units": "millimeters", "values": (step * np.arange(n) - 0.02).tolist()}
+            for axis, step, n in (("x", 0.01, nx), ("y", 0.02, ny))}  # fmt: skip
+    grid["z"] = {"units": "microns", "values": (2.0 * np.arange(nz)).tolist()}
+    said = json.dumps({"metadata": grid, "clim": [-20.0, 45.534], "version": version} | change)
+    first, *rest = (Image.fromarray(page) for page in levels)
+    first.save(path, save_all=True, append_images=rest, compression="packbits", tiffinfo={305: said})
+    return levels
+
+
+def test_stack_of_myoct(tmp_path):
+    levels = myoct(tmp_path / "a.tif")
+    read = op.read_oct(tmp_path / "a.tif", index_applied=1.4)
+    expected = -20.0 + 1e-3 * (levels.astype(float) - 1.0)  # dB: 65.534 over 65534 steps
+    expected[0, 0, 0] = np.nan
+    np.testing.assert_allclose(read.values, np.moveaxis(expected, 1, 2), atol=1e-4)
+    np.testing.assert_allclose(read.spacing, (0.01, 0.02), rtol=1e-6)
+    np.testing.assert_allclose(read.optical_spacing, 1.4 * 2e-3, rtol=1e-6)
+    assert read.scale == "db"
+    with pytest.raises(op.MeasurementError, match="needs index_applied=: myOCT does not state"):
+        op.read_oct(tmp_path / "a.tif")
+    myoct(tmp_path / "b.tif", metadata=None)
+    with pytest.raises(op.MeasurementError, match=r"needs spacing=\(dx, dy\)"):
+        op.read_oct(tmp_path / "b.tif", index_applied=1.4)
+    stated = op.read_oct(tmp_path / "b.tif", spacing=0.01, depth_spacing=2e-3)
+    np.testing.assert_allclose(stated.values, read.values)
+    for message, change in (
+        ("myOCT's of version 2 in uint8", {"version": 2, "dtype": np.uint8}),
+        ("clim must be two numbers", {"clim": None}),
+    ):
+        myoct(tmp_path / "b.tif", **change)
+        with pytest.raises(op.MeasurementError, match=message):
+            op.read_oct(tmp_path / "b.tif")
 
 
 def test_what_is_not_stated_is_asked_for(tmp_path):
