@@ -1,7 +1,8 @@
 """Damaged OCT files: each is read as what it says, or refused in one line.
 
 Run `python -m benchmarks.oct_mutations [--files 10000] [--seed 0]`. Files are those of `write_oct`, volumes and raw
-spectra, .oct as it is and compressed, and .h5, and a TIFF stack of myOCT, with bytes changed, cut out, put in or cut off, and with numbers and names of the header replaced.
+spectra, .oct as it is and compressed, and .h5, and a TIFF stack of myOCT, with bytes changed, cut out, put in or cut
+off, and with numbers and names of the header replaced.
 Chunks run in processes of their own with limited memory, so that a crash is seen. Prints one JSON line.
 """
 
@@ -153,7 +154,7 @@ def child(seed: int, first: int, count: int) -> None:
 
 def _ending(path: Path) -> str:
     try:
-        volume = op.read_oct(path, index_applied=1.0)
+        volume = op.read_oct(path, index_applied=1.0 if path.suffix == ".tif" else None)
         volume.intensity().sum()
     except op.MeasurementError as refusal:
         said = str(refusal)
