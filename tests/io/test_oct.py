@@ -247,6 +247,20 @@ def test_cut_off_file(tmp_path):
             op.read_oct(tmp_path / "b.oct")
 
 
+def test_refusal_of_a_damaged_name_is_short(tmp_path):
+    """An entry whose name is said to be as long as the file is not quoted whole."""
+    op.write_oct(volume(), tmp_path / "a.oct")
+    path = rewritten(tmp_path / "a.oct", tmp_path / "b.oct", zipfile.ZIP_DEFLATED)
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        at = archive.getinfo("data\\Intensity.data").header_offset
+    content[at + 26 : at + 28] = (1500).to_bytes(2, "little")
+    path.write_bytes(content)
+    with pytest.raises(op.MeasurementError, match=r"BadZipFile: File name in directory .* …\)") as refusal:
+        op.read_oct(path)
+    assert len(str(refusal.value)) < 700
+
+
 def test_claims_beyond_memory_are_refused(tmp_path):
     """An entry that says it unpacks to terabytes is never unpacked."""
     op.write_oct(volume(), tmp_path / "a.oct")
