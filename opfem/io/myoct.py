@@ -1,6 +1,6 @@
 """TIFF stacks of myOCT: dB on 16 bits, with their limits and grid as JSON in a tag.
 
-Called by the reader of TIFF files where that JSON is there; depth there counts from where myOCT put its focus.
+Called by the reader of TIFF files where that JSON is there. Its depths count from the focus; only their steps are used.
 """
 
 import json
@@ -38,8 +38,8 @@ def decoded(values: np.ndarray, said: dict[str, Any]) -> np.ndarray:
     limits = said.get("clim")
     if said["version"] != _VERSION or values.dtype != np.uint16:
         raise MeasurementError(
-            f"is myOCT's of version {said['version']} in {values.dtype}; read it with myOCT and write it again, which "
-            f"makes version {_VERSION} in uint16."
+            f"is myOCT's of version {str(said['version'])[:20]!r} in {values.dtype}; read it with "
+            f"myOCT and write it again, which makes version {_VERSION} in uint16."
         )
     try:
         low, high = sorted(float(limit) for limit in limits)  # pyright: ignore[reportOptionalIterable]

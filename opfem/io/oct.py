@@ -53,8 +53,8 @@ def read_oct(
     """Read an OCT volume.
 
     Read are ThorImage's .oct and the folder it unpacks to, files of `write_oct`, TIFF stacks (those of myOCT are
-    decoded), HDF5 and MATLAB files, .npy, and raw numbers. Volumes that are not compressed stay in the file. Raw
-    spectra are transformed; repeated A-lines and B-scans become their mean power.
+    decoded; depth counts from their first row), HDF5 and MATLAB files, .npy, and raw numbers. Volumes that are not
+    compressed stay in the file. Raw spectra are transformed; repeated A-lines and B-scans become their mean power.
 
     Args:
         path: File, or folder that holds a Header.xml.

@@ -185,7 +185,7 @@ def test_stack_of_myoct(tmp_path):
     stated = op.read_oct(tmp_path / "b.tif", spacing=0.01, depth_spacing=2e-3)
     np.testing.assert_allclose(stated.values, read.values)
     for message, change in (
-        ("myOCT's of version 2 in uint8", {"version": 2, "dtype": np.uint8}),
+        ("myOCT's of version '2' in uint8", {"version": 2, "dtype": np.uint8}),
         ("clim must be two numbers", {"clim": None}),
     ):
         myoct(tmp_path / "b.tif", **change)

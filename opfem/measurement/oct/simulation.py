@@ -103,6 +103,8 @@ def simulate_oct(
     """
     check_positive("simulate_oct.spacing (dx, dy)", "mm", spacing)
     check_positive("simulate_oct.depth_spacing", "mm", depth_spacing)
+    if not spectra and any(dispersion):
+        raise ValueError("simulate_oct.dispersion [rad] is that of spectra; pass spectra=True as well.")
     if shape is None:
         if callable(surface) and not isinstance(surface, ThicknessMap):
             raise ValueError("simulate_oct.shape (ny, nx) is needed for a surface that is a function.")
