@@ -240,16 +240,20 @@ def coin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def loop() -> None:
-    """Go from a known pressure to a volume in a file, and back to the pressure by `Imprint` and by the fit."""
-    side, lines = 2.0, 128
-    palpation = op.Palpation(
-        op.Layer(0.5, op.MooneyRivlin(2.23e-3, 7.03e-4, 0.11732)), (side, side), (16, 16, 4),
-        window=op.Contact(op.HardOverclosure(), 0.15),
-        sample=op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.05),
+    """Go from a known pressure, of a layer on a finer mesh, to a volume in a file, and back by `Imprint` and by fit."""
+    side, lines, elements = 2.0, 128, 16
+    fine, palpation = (
+        op.Palpation(
+            op.Layer(0.5, op.MooneyRivlin(2.23e-3, 7.03e-4, 0.11732)), (side, side), (count, count, count // 4),
+            window=op.Contact(op.HardOverclosure(), 0.15),
+            sample=op.Contact(op.ExponentialOverclosure(2.0, 0.01), 0.05),
+        )
+        for count in (2 * elements, elements)
     )  # fmt: skip
-    nodes = np.meshgrid(*2 * [np.linspace(0.0, side, 17)])
+    nodes = np.meshgrid(*2 * [np.linspace(0.0, side, 2 * elements + 1)])
     truth = coin(*nodes)
-    scene = op.oct_scene(op.solve(palpation, op.Traction(truth)))
+    scene = op.oct_scene(op.solve(fine, op.Traction(truth)))
+    truth = truth[::2, ::2]
     step = side / (lines - 1)
     x, y = np.meshgrid(*2 * [step * np.arange(lines)])
     exact = op.ThicknessMap(np.asarray(scene.surface.sample(x, y)), extent=(side, side))
@@ -269,7 +273,9 @@ def loop() -> None:
         "map_rms_um": np.sqrt(np.mean(error**2)) / UM,
         "imprint_difference": float(np.linalg.norm(pressures[0] - pressures[1]) / np.linalg.norm(pressures[1])),
     }
-    prior = op.Matern(length=0.3, std=1.5e-3, mean=3.5e-3)
+    # As `opfem fit` takes it where it is not given.
+    around = op.uniaxial_estimate(palpation, found)
+    prior = op.Matern(length=3 * side / elements, std=around.std(), mean=around.mean())
     first = op.fit_traction(palpation, found, prior, draws=2)
     model_std = float(np.sqrt(np.mean(op.mesh_error(first.solution) ** 2)))
     for name, std in (("", 0.0), ("_with_model_std", model_std)):
@@ -278,6 +284,7 @@ def loop() -> None:
         row |= {
             f"inside_95{name}": float(np.mean(np.abs(score) < 1.96)),
             f"chi2{name}": float(fit.reduced_chi2),
+            f"left{name}": float((fit.observed - fit.effective_dof) / fit.observed),
             f"fit_difference{name}": float(np.linalg.norm(fit.normal - truth) / np.linalg.norm(truth)),
         }
     print(json.dumps({**row, "model_std_um": model_std / UM}))

@@ -1,7 +1,8 @@
 """Damaged OCT files: each is read as what it says, or refused in one line.
 
-Run `python -m benchmarks.oct_mutations [--files 10000] [--seed 0]`. Files are those of `write_oct`, .oct as it is and
-compressed, and .h5, with bytes changed, cut out, put in or cut off, and with numbers and names of the header replaced.
+Run `python -m benchmarks.oct_mutations [--files 10000] [--seed 0]`. Files are those of `write_oct`, volumes and raw
+spectra, .oct as it is and compressed, and .h5, and a TIFF stack of myOCT, with bytes changed, cut out, put in or cut
+off, and with numbers and names of the header replaced.
 Chunks run in processes of their own with limited memory, so that a crash is seen. Prints one JSON line.
 """
 
@@ -18,6 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import tifffile
 
 import opfem as op
 
@@ -48,7 +50,10 @@ def originals(folder: Path) -> dict[str, bytes]:
     """Write small files to damage."""
     rng = np.random.default_rng(0)
     real = rng.normal(20.0, 5.0, (3, 5, 16)).astype(np.float32)
-    volumes = {
+    counts = rng.integers(0, 4000, (4, 6, 32)).astype(np.uint16)
+    volumes: dict[str, op.OctVolume | op.Spectra] = {
+        "spectra": op.Spectra(counts, 0.01, 5e-3, wavelength=845e-6),
+        "repeats": op.Spectra(counts, 0.01, 5e-3, repeats=(2, 3)),
         "real": op.OctVolume(real, (0.01, 0.02), 2.5e-3, "db", wavelength=845e-6),
         "complex": op.OctVolume((real + 1j * real[::-1]).astype(np.complex64), 0.01, 2.5e-3, "complex", phase_sign=1),
     }
@@ -61,6 +66,11 @@ def originals(folder: Path) -> dict[str, bytes]:
         ):
             for info in old.infolist():
                 new.writestr(info.filename, old.read(info))
+    said = {axis: {"units": "mm", "values": [0.0, 0.01, 0.02]} for axis in "xyz"}
+    with tifffile.TiffWriter(folder / "myoct.tif") as file:
+        for page in counts:
+            described = json.dumps({"metadata": said, "clim": [0, 60], "version": 3})
+            file.write(page, software=described, metadata=None, contiguous=False)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
@@ -144,7 +154,7 @@ def child(seed: int, first: int, count: int) -> None:
 
 def _ending(path: Path) -> str:
     try:
-        volume = op.read_oct(path)
+        volume = op.read_oct(path, index_applied=1.0 if path.suffix == ".tif" else None)
         volume.intensity().sum()
     except op.MeasurementError as refusal:
         said = str(refusal)

@@ -18,6 +18,8 @@ from .tiff_files import list_tiff
 
 Result = TypeVar("Result")
 
+_MOST_SAID = 300  # characters of what a library says: some quote the damaged bytes
+
 READERS: dict[str, Callable[[Reading], dict[str, Entry]]] = {
     ".mat": list_mat,
     ".npy": list_npy,
@@ -82,6 +84,8 @@ def guarded(path: Path, action: Callable[[], Result]) -> Result:
         if isinstance(cause, MeasurementError):
             raise MeasurementError(f"{path}: {cause}") from cause
         said = " ".join(str(cause).split())
+        if len(said) > _MOST_SAID:
+            said = said[:_MOST_SAID] + " …"
         raise MeasurementError(
             f"{path}: cannot be read, it may be damaged or of another format ({type(cause).__name__}: {said})."
         ) from cause

@@ -3,9 +3,7 @@
 First step from the microscope: Thorlabs' containers know their own grid; of other files the caller states it.
 """
 
-import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,18 +11,19 @@ import h5py
 import numpy as np
 
 from ..measurement import MeasurementError, Step
-from ..measurement.oct import OctVolume
+from ..measurement.oct import OctVolume, Spectra
 from ..measurement.oct.lines import profile_lattice
-from ..measurement.oct.spectra import Spectra
 from ..measurement.oct.volume import SCALES, Scale
 from .array_files import guarded
 from .atomic import whole_file
-from .raw_volume import Stored, ordered, read_hdf5, read_mat5, read_npy, read_raw, read_tiff
-from .thorlabs import Container, spectra_of, volume_of
+from .oct_hdf5 import own_spectra, own_volume, write_hdf5
+from .raw_volume import ordered, read_hdf5, read_mat5, read_npy, read_raw, read_tiff
+from .thorlabs import Container
+from .thorlabs_arrays import spectra_of, volume_of
+from .thorlabs_writing import write_ocity
 
 Quantity = Literal["auto", "intensity", "complex", "spectra"]
 
-_FORMAT = "opfem oct 1"
 _EXPORT = "export RAW, 32-bit TIFF or HDF5 from the program that wrote it"
 _UNREADABLE = {
     ".img": "Thorlabs' old swept-source .IMG",
@@ -53,8 +52,9 @@ def read_oct(
 ) -> OctVolume:
     """Read an OCT volume.
 
-    Read are ThorImage's .oct and the folder it unpacks to, files of `write_oct`, TIFF stacks, HDF5 and MATLAB files,
-    .npy, and raw numbers. Volumes that are not compressed stay in the file.
+    Read are ThorImage's .oct and the folder it unpacks to, files of `write_oct`, TIFF stacks (those of myOCT are
+    decoded; depth counts from their first row), HDF5 and MATLAB files, .npy, and raw numbers. Volumes that are not
+    compressed stay in the file. Raw spectra are transformed; repeated A-lines and B-scans become their mean power.
 
     Args:
         path: File, or folder that holds a Header.xml.
@@ -91,9 +91,12 @@ def read_oct(
             "raw": lambda: read_raw(path, shape, order, dtype),
         }
         stored = readers[form]()
-        if _text(stored.attributes.get("format")) == _FORMAT:
-            return _restated(_own(stored), scale, own)
+        found = own_volume(stored) or own_spectra(stored)
+        if found is not None:
+            return _restated(found if isinstance(found, OctVolume) else found.to_volume(), scale, own)
         values = ordered(stored.values, order if order or form != "tiff" else "xzy")
+        if "dz" in stored.attributes:
+            return _of_myoct(values, stored.attributes, spacing, depth_spacing, index_applied, own)
         return _stated(values, spacing, depth_spacing, index_applied, scale, own)
 
     volume = guarded(path, read)
@@ -108,7 +111,7 @@ def read_spectra(
     depth_spacing: float | None = None,
     index_applied: float | None = None,
 ) -> Spectra:
-    """Read the raw spectra of a Thorlabs file or folder; see `read_oct` for the arguments.
+    """Read raw spectra of a Thorlabs file or folder, or of a .h5 of `write_oct`; see `read_oct` for the arguments.
 
     Raises:
         MeasurementError: For anything wrong with the file; names the path and the cause.
@@ -116,28 +119,35 @@ def read_spectra(
     path = Path(path)
 
     def read() -> Spectra:
-        if _form(path) != "thorlabs":
-            raise MeasurementError("raw spectra are read from Thorlabs' .oct; of others make op.Spectra of an array.")
-        return spectra_of(Container(path), spacing, depth_spacing, index_applied)
+        form = _form(path)
+        if form == "thorlabs":
+            return spectra_of(Container(path), spacing, depth_spacing, index_applied)
+        spectra = own_spectra(read_hdf5(path, None)) if form == "hdf5" else None
+        if spectra is None:
+            raise MeasurementError(
+                "raw spectra are read from Thorlabs' .oct and .h5 of write_oct; of others make op.Spectra of an array."
+            )
+        return spectra
 
     return guarded(path, read)
 
 
-def write_oct(volume: OctVolume, path: str | os.PathLike) -> None:
-    """Write a volume to .h5, or to Thorlabs' .oct, whole or not at all.
+def write_oct(volume: OctVolume | Spectra, path: str | os.PathLike) -> None:
+    """Write a volume, or raw spectra, to .h5 or to Thorlabs' .oct, whole or not at all.
 
     Both keep grid, scale and wavelength; .h5 keeps the steps as well. A .oct file holds dB or complex numbers: linear
-    power is written as dB.
+    power is written as dB. Of spectra it holds whole counts, from short to long wavelength, after apodisation lines of
+    the reference.
 
     Args:
-        volume: Volume to write; one that lies in a file is copied by B-scans.
+        volume: Volume or spectra to write; what lies in a file is copied by B-scans.
         path: File to make or replace; must end in .h5 or .oct.
 
     Raises:
         ValueError: For another suffix.
     """
     path = Path(path)
-    writers = {".h5": _write_hdf5, ".hdf5": _write_hdf5, ".oct": _write_ocity}
+    writers = {".h5": write_hdf5, ".hdf5": write_hdf5, ".oct": write_ocity}
     writer = writers.get(path.suffix.lower())
     if writer is None:
         raise ValueError(f"write_oct writes .h5 or .oct, got {path}.")
@@ -210,6 +220,19 @@ def _stated(values: np.ndarray, spacing, depth_spacing, index_applied, scale, ow
     return OctVolume(values, spacing, depth_spacing * applied, scale, steps=(step,), **own)
 
 
+def _of_myoct(values: np.ndarray, known: dict[str, Any], spacing, depth_spacing, index_applied, own) -> OctVolume:
+    """Make a volume in dB by what myOCT says of its grid, where the caller does not."""
+    if spacing is None and None not in (known["dx"], known["dy"]):
+        spacing = (known["dx"], known["dy"])
+    if depth_spacing is None and known["dz"] is not None:
+        if index_applied is None:
+            raise MeasurementError(
+                "needs index_applied=: myOCT does not state the refractive index it divided depth by."
+            )
+        depth_spacing = known["dz"]
+    return _stated(values, spacing, depth_spacing, index_applied, "db", own)
+
+
 def _guess(values: np.ndarray) -> str:
     if values.dtype.kind == "c":
         return "values are complex"
@@ -243,84 +266,3 @@ def _check_content(volume: OctVolume) -> None:
     known = some[~missing]
     if (known == known[0]).all():
         raise MeasurementError(f"all samples are {known[0]:g}; the volume is empty.")
-
-
-def _own(stored: Stored) -> OctVolume:
-    known = stored.attributes
-    steps = json.loads(_text(known["steps"]))
-    sign, wavelength = int(known["phase_sign"]), float(known["wavelength"])
-    return OctVolume(
-        stored.values,
-        known["spacing"],
-        float(known["optical_spacing"]),
-        _text(known["scale"]),  # pyright: ignore[reportArgumentType]
-        origin=known["origin"],
-        depth_origin=float(known["depth_origin"]),
-        wavelength=wavelength if wavelength > 0 else None,
-        phase_sign=sign or None,
-        steps=tuple(Step(str(name), **numbers) for name, numbers in steps),
-    )
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
-def _write_hdf5(volume: OctVolume, path: Path) -> None:
-    """Write one data set in one piece, so that it can be read in place; complex as MATLAB's {real, imag}."""
-    values = volume.values
-    is_complex = volume.scale == "complex"
-    wide = np.dtype(values.dtype).itemsize > (8 if is_complex else 4)
-    part = "<f8" if wide else "<f4"
-    kind = np.dtype([("real", part), ("imag", part)]) if is_complex else np.dtype(values.dtype)
-    steps = [[s.name, {key: np.asarray(value).tolist() for key, value in s.numbers.items()}] for s in volume.steps]
-    # From this version on HDF5 keeps checksums, which tell a damaged file.
-    with h5py.File(path, "w", libver=("v108", "v110")) as file:
-        data = file.create_dataset("values", volume.shape, kind)
-        for row in range(volume.shape[0]):
-            block = np.ascontiguousarray(values[row])
-            data[row] = block.view(kind) if is_complex else block
-        data.attrs.update(
-            {
-                "format": np.bytes_(_FORMAT),
-                "scale": np.bytes_(volume.scale),
-                "spacing": np.asarray(volume.spacing),
-                "origin": np.asarray(volume.origin),
-                "optical_spacing": float(volume.optical_spacing),
-                "depth_origin": float(volume.depth_origin),
-                "wavelength": 0.0 if volume.wavelength is None else float(volume.wavelength),
-                "phase_sign": volume.phase_sign or 0,
-                "steps": np.bytes_(json.dumps(steps)),
-            }
-        )
-
-
-def _write_ocity(volume: OctVolume, path: Path) -> None:
-    """Write a ZIP file of uncompressed entries, as ThorImage does."""
-    ny, nx, nz = volume.shape
-    is_complex = volume.scale == "complex"
-    name, kind, dtype = ("Complex", "Complex", "<c8") if is_complex else ("Intensity", "Real", "<f4")
-    dx, dy = np.asarray(volume.spacing, float).tolist()
-    dz = float(volume.optical_spacing)
-    sizes = f'SizeZ="{nz}" SizeX="{nx}" SizeY="{ny}" RangeZ="{dz * nz!r}" RangeX="{dx * nx!r}" RangeY="{dy * ny!r}"'
-    nanometres = 0.0 if volume.wavelength is None else 1e6 * float(volume.wavelength)
-    x, y = np.asarray(volume.origin, float).tolist()
-    own = f'origin="{x!r} {y!r}" depth_origin="{float(volume.depth_origin)!r}" phase_sign="{volume.phase_sign}"'
-    header = (
-        f'<?xml version="1.0" encoding="utf-8"?>\n<Ocity version="1.0"><DataFiles><DataFile Type="{kind}" {sizes} '
-        f'BytesPerPixel="{np.dtype(dtype).itemsize}">data\\{name}.data</DataFile></DataFiles>'
-        f'<Image Type="Processed"><SizePixel Unit="px"><SizeZ>{nz}</SizeZ><SizeX>{nx}</SizeX><SizeY>{ny}</SizeY>'
-        "</SizePixel>"
-        f'<SizeReal Unit="mm"><SizeZ>{dz * nz!r}</SizeZ><SizeX>{dx * nx!r}</SizeX><SizeY>{dy * ny!r}</SizeY></SizeReal>'
-        "<AxisOrder>ZXYT</AxisOrder></Image><Acquisition><RefractiveIndex>1.000000</RefractiveIndex></Acquisition>"
-        f"<Instrument><CentralWavelength>{nanometres!r}</CentralWavelength></Instrument>"
-        f"<MetaInfo><AcquisitionMode>Mode3D</AcquisitionMode><Opfem {own}/></MetaInfo></Ocity>\n"
-    )
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr("Header.xml", header)
-        with archive.open(zipfile.ZipInfo(f"data\\{name}.data"), "w", force_zip64=True) as entry:
-            for row in range(ny):
-                block = np.asarray(volume.values[row])
-                if volume.scale == "linear":
-                    block = 10.0 * np.log10(np.maximum(block, 1e-30))
-                entry.write(np.ascontiguousarray(block, dtype).data)

@@ -15,13 +15,19 @@ import scipy.io
 import tifffile
 
 from ..measurement import MeasurementError
+from .myoct import decoded, myoct_description, spacing_of
 from .thorlabs import LARGEST_UNPACKED
 
 OWN_ATTRIBUTES = (
     "format", "scale", "spacing", "origin", "optical_spacing", "depth_origin", "wavelength", "phase_sign", "steps",
+    "dispersion", "is_ascending", "repeats",
 )  # fmt: skip
-"""What `write_oct` states of a volume in HDF5."""
+"""What `write_oct` states of a volume or spectra in HDF5."""
 
+VECTORS = ("reference", "offset", "chirp")
+"""What it states of every pixel of a spectrometer, as data sets."""
+
+_MOST_PIXELS = 2**20  # of a spectrometer; real ones have 2048 or 4096
 _LARGEST_ATTRIBUTE = 2**16  # bytes; HDF5 keeps no larger ones with their data set
 _COMPLEX = (np.dtype([("real", "<f4"), ("imag", "<f4")]), np.dtype([("real", "<f8"), ("imag", "<f8")]))
 
@@ -31,6 +37,7 @@ class Stored(NamedTuple):
 
     values: np.ndarray
     attributes: dict[str, Any]
+    vectors: dict[str, np.ndarray]
 
 
 def read_raw(path: Path, shape: tuple[int, int, int] | None, order: str | None, dtype: Any) -> Stored:
@@ -50,7 +57,7 @@ def read_raw(path: Path, shape: tuple[int, int, int] | None, order: str | None, 
     expected, size = math.prod(shape) * kind.itemsize, path.stat().st_size
     if size != expected:
         raise MeasurementError(f"shape {shape} of {kind} takes {expected} bytes, the file has {size}.")
-    return Stored(np.memmap(path, kind, "r", shape=tuple(sizes[axis] for axis in order[::-1])), {})
+    return Stored(np.memmap(path, kind, "r", shape=tuple(sizes[axis] for axis in order[::-1])), {}, {})
 
 
 def read_npy(path: Path) -> Stored:
@@ -58,7 +65,7 @@ def read_npy(path: Path) -> Stored:
     values = np.load(path, mmap_mode="r", allow_pickle=False)
     # Of an array in Fortran's order the first axis is the fastest.
     turned = values.flags.f_contiguous and not values.flags.c_contiguous
-    return Stored(values.T if turned else values, {})
+    return Stored(values.T if turned else values, {}, {})
 
 
 def read_hdf5(path: Path, variable: str | None) -> Stored:
@@ -77,14 +84,47 @@ def read_hdf5(path: Path, variable: str | None) -> Stored:
         if kind.kind not in "fiuc":
             raise MeasurementError(f"{name} must hold numbers, got {data.dtype}.")
         attributes = {name: data.attrs[name] for name in OWN_ATTRIBUTES if _is_short(data, name)}
-        offset = data.id.get_offset()
-        if offset is not None and data.chunks is None and not data.external:
-            end = offset + math.prod(data.shape) * kind.itemsize
-            if end > os.path.getsize(path):
-                raise MeasurementError(f"{name} should end at byte {end}, the file has {os.path.getsize(path)}.")
-            return Stored(np.memmap(path, kind, "r", offset, data.shape), attributes)
-        _check_memory(name, math.prod(data.shape) * kind.itemsize)
-        return Stored(np.ascontiguousarray(data[()]).view(kind), attributes)
+        size = math.prod(data.shape) * kind.itemsize
+        offset = _place(data, os.path.getsize(path))
+        if offset is not None:
+            if offset + size > os.path.getsize(path):
+                raise MeasurementError(
+                    f"{name} should end at byte {offset + size}, the file has {os.path.getsize(path)}."
+                )
+            values = np.memmap(path, kind, "r", offset, data.shape)
+        else:
+            _check_memory(name, size)
+            values = np.ascontiguousarray(data[()]).view(kind)
+        return Stored(values, attributes, _vectors(found, data.shape[2]) if "repeats" in attributes else {})
+
+
+def _vectors(found: dict[str, h5py.Dataset], pixels: int) -> dict[str, np.ndarray]:
+    """Read what is stated of every pixel of a spectrometer."""
+    if pixels > _MOST_PIXELS:
+        raise MeasurementError(f"spectra must have at most {_MOST_PIXELS} pixels, got {pixels}.")
+    for name in VECTORS:
+        if name not in found or found[name].shape != (pixels,) or found[name].dtype.kind != "f":
+            raise MeasurementError(f"must state {name} as one number a pixel, {pixels}.")
+    return {name: found[name][()] for name in VECTORS}
+
+
+def _place(data: h5py.Dataset, end: int) -> int | None:
+    """Find the byte at which a data set begins that lies in one piece in a file of `end` bytes; None where none does.
+
+    Chunks of whole B-scans may lie one after another, too.
+    """
+    if data.chunks is None:
+        return None if data.external else data.id.get_offset()
+    size = math.prod(data.shape) * data.dtype.itemsize
+    if data.id.get_create_plist().get_nfilters() or data.chunks[1:] != data.shape[1:] or size > end:
+        return None
+    chunks: list[tuple[int, int]] = []
+    data.id.chunk_iter(lambda chunk: chunks.append((chunk.chunk_offset[0], chunk.byte_offset)))
+    step = data.chunks[0]
+    size = math.prod(data.chunks) * data.dtype.itemsize
+    begin = chunks[0][1] if chunks else 0
+    expected = [(row, begin + size * (row // step)) for row in range(0, data.shape[0], step)]
+    return begin if chunks == expected and data.shape[0] % step == 0 else None
 
 
 def _is_short(data: h5py.Dataset, name: str) -> bool:
@@ -100,11 +140,12 @@ def read_mat5(path: Path, variable: str | None) -> Stored:
     shapes = {name: shape for name, shape, _ in scipy.io.whosmat(path) if len(shape) == 3}
     name = _chosen(variable, shapes)
     _check_memory(name, 16 * math.prod(shapes[name]))
-    return Stored(np.asarray(scipy.io.loadmat(path, variable_names=[name])[name]).T, {})
+    return Stored(np.asarray(scipy.io.loadmat(path, variable_names=[name])[name]).T, {}, {})
 
 
 def read_tiff(path: Path) -> Stored:
-    """Read the pages of a TIFF file as one volume: [page, row, column]."""
+    """Read the pages of a TIFF file as one volume: [page, row, column]; of myOCT's with its grid."""
+    attributes: dict[str, Any] = {}
     with tifffile.TiffFile(path) as file:
         if len(file.series) > 1 and all(series.shape == file.series[0].shape for series in file.series):
             shape = (len(file.series), *file.series[0].shape)
@@ -130,7 +171,12 @@ def read_tiff(path: Path) -> Stored:
         else:
             listed = ", ".join(str(series.shape) for series in file.series[:8])
             raise MeasurementError(f"holds images of several sizes, {listed}; a volume is a stack of one size.")
-    return Stored(values[None] if values.ndim == 2 else values, {})
+        said = myoct_description(file)
+        if said is not None:
+            _check_memory("the stack", 4 * values.size)
+            values = decoded(values, said)
+            attributes = {f"d{axis}": spacing_of(said, axis) for axis in "xyz"}
+    return Stored(values[None] if values.ndim == 2 else values, attributes, {})
 
 
 def ordered(values: np.ndarray, order: str | None) -> np.ndarray:

@@ -14,9 +14,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from ..measurement import MeasurementError, Step
-from ..measurement.oct import OctVolume
-from ..measurement.oct.spectra import Spectra
+from ..measurement import MeasurementError
 
 LARGEST_UNPACKED = 2**31
 """Most bytes of a compressed array that are unpacked into memory."""
@@ -27,7 +25,6 @@ _MOST_ELEMENTS, _DEEPEST = 200_000, 50  # of a header; real ones hold a few thou
 _DEFLATE = 1032  # largest ratio that deflate can reach: an entry that claims more is not what it says
 _DTYPES = {("Real", 4): "<f4", ("Real", 8): "<f8", ("Complex", 8): "<c8", ("Complex", 16): "<c16"}
 _RAW = {(1, True): "i1", (1, False): "u1", (2, True): "<i2", (2, False): "<u2", (4, True): "<i4", (4, False): "<u4"}
-_LINES = 25  # apodisation lines that are written before each B-scan of spectra
 
 
 class DataFile(NamedTuple):
@@ -90,7 +87,13 @@ class Container:
     def number(self, tag: str, default: float) -> float:
         """Read the number in an element of the header, by its path."""
         text = self.text(tag)
-        return default if text is None else _number(tag, text)
+        return default if text is None else number_in(tag, text)
+
+    @property
+    def own(self) -> dict[str, str]:
+        """What `write_oct` states beyond OCITY."""
+        node = self.header.find("MetaInfo/Opfem")
+        return {} if node is None else dict(node.attrib)
 
     def choose(self, prefix: str, kind: str) -> DataFile | None:
         """Find the only array of a kind whose name begins so; None where there is none."""
@@ -271,11 +274,11 @@ def data_file(node: Element) -> DataFile:
 
     def length(key: str) -> float | None:
         text = node.get(key)
-        return None if text is None else _number(f"{name}: {key}", text)
+        return None if text is None else number_in(f"{name}: {key}", text)
 
     keys = ("ApoRegionStart0", "ApoRegionEnd0", "ScanRegionStart0", "ScanRegionEnd0")
     stated = [node.get(key) for key in keys]
-    lines = None if None in stated else tuple(int(_number(k, str(v))) for k, v in zip(keys, stated, strict=True))
+    lines = None if None in stated else tuple(int(number_in(k, str(v))) for k, v in zip(keys, stated, strict=True))
     kind = node.get("Type", "")
     sizes = (1, 1, 1) if kind == "Colored" else (whole("SizeY", 1), whole("SizeX", 1), whole("SizeZ"))
     return DataFile(
@@ -288,7 +291,8 @@ def data_file(node: Element) -> DataFile:
     )
 
 
-def _number(what: str, text: str) -> float:
+def number_in(what: str, text: str) -> float:
+    """Read a finite number; `what` names it in the error."""
     try:
         value = float(text)
     except ValueError:
@@ -301,92 +305,3 @@ def _number(what: str, text: str) -> float:
 def _listed(names: Any) -> str:
     names = [str(name)[:60] for name in names]
     return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "") if names else "nothing"
-
-
-def volume_of(
-    container: Container, file: DataFile, spacing: Any, depth_spacing: float | None, index_applied: float | None
-) -> OctVolume:
-    """Make a volume of an array of processed data."""
-    if file.kind not in ("Real", "Complex"):
-        raise MeasurementError(f"{file.stem} is of Type {file.kind!r}; a volume is Real or Complex.")
-    values = container.array(file)
-    applied = container.number("Acquisition/RefractiveIndex", 1.0) if index_applied is None else index_applied
-    own = container.header.find("MetaInfo/Opfem")
-    known = {} if own is None else dict(own.attrib)
-    wavelength = container.number("Instrument/CentralWavelength", 0.0)
-    return OctVolume(
-        values,
-        _lateral(file, file.shape[1]) if spacing is None else spacing,
-        _depth(file, applied) if depth_spacing is None else depth_spacing * applied,
-        "complex" if file.kind == "Complex" else "db",
-        origin=tuple(_number("Opfem origin", text) for text in known.get("origin", "0 0").split())[:2],
-        depth_origin=_number("Opfem depth_origin", known.get("depth_origin", "0")),
-        wavelength=wavelength * 1e-6 if wavelength > 0 else None,
-        phase_sign={"1": 1, "-1": -1}.get(known.get("phase_sign", "")),
-        steps=(Step("read", index_applied=applied),),
-    )
-
-
-def spectra_of(container: Container, spacing: Any, depth_spacing: float | None, index_applied: float | None) -> Spectra:
-    """Make spectra of the raw data, one array for each part of the scan."""
-    files = [file for file in container.files if file.kind == "Raw" and file.stem.startswith("Spectral")]
-    if not files:
-        raise MeasurementError(f"holds no raw spectra; it holds {', '.join(file.stem for file in container.files)}.")
-    for tag in ("IntensityAveraging/AScans", "SpeckleAveraging/SlowAxis", "SpeckleAveraging/FastAxis"):
-        if container.number(f"Acquisition/{tag}", 1.0) > 1:
-            raise MeasurementError(f"{tag} is above 1, and opfem does not average raw spectra; export Intensity.")
-    files.sort(key=lambda file: (len(file.stem), file.stem))
-    if len({(file.shape[1:], file.lines, file.width) for file in files}) > 1:
-        raise MeasurementError("parts of the raw spectra differ in size.")
-    pixels, first = files[0].shape[2], files[0]
-    total = sum(math.prod(file.shape) for file in files)
-    if 4 * total > LARGEST_UNPACKED:
-        raise MeasurementError(
-            f"the raw spectra take {4 * total / 2**30:.1f} GB, above 2 GB; export Complex or Intensity."
-        )
-    counts = np.concatenate([np.asarray(container.array(file), np.float32) for file in files])
-    counts *= np.float32(container.number("Instrument/BinaryToElectronCountScaling", 1.0))
-    offset = container.vector("OffsetErrors", pixels)
-    offset = np.zeros(pixels) if offset is None else offset
-    lines = first.lines or (0, 0, 0, first.shape[1])
-    bounds = (0 <= lines[0] <= lines[1] <= first.shape[1]) and (0 <= lines[2] < lines[3] <= first.shape[1])
-    if not bounds:
-        raise MeasurementError(f"regions of apodisation and scan, {lines}, do not fit {first.shape[1]} lines.")
-    reference = container.vector("ApodizationSpectrum", pixels)
-    if lines[1] > lines[0]:
-        reference = counts[:, lines[0] : lines[1]].mean(axis=(0, 1), dtype=float) - offset
-    applied = container.number("Acquisition/RefractiveIndex", 1.0) if index_applied is None else index_applied
-    chirp = container.vector("Chirp", pixels)
-    wavelength = container.number("Instrument/CentralWavelength", 0.0)
-    return Spectra(
-        counts[:, lines[2] : lines[3]],
-        _lateral(first, lines[3] - lines[2]) if spacing is None else spacing,
-        2.0 * _depth(first, applied) if depth_spacing is None else depth_spacing * applied,
-        reference=reference,
-        offset=offset,
-        chirp=chirp,
-        wavelength=wavelength * 1e-6 if wavelength > 0 else None,
-        is_ascending=False,  # Thorlabs' spectrometers and chirps run from short to long wavelength
-        steps=(Step("read", index_applied=applied),),
-    )
-
-
-def _lateral(file: DataFile, columns: int) -> tuple[float, float]:
-    ny = file.shape[0]
-    range_y, range_x, _ = file.ranges
-    if not range_x or range_x < 0:
-        raise MeasurementError(f"{file.stem} states no RangeX; pass spacing=(dx, dy) [mm].")
-    if ny == 1:
-        return range_x / columns, range_x / columns
-    if not range_y or range_y < 0:
-        raise MeasurementError(
-            f"{file.stem} has {ny} frames over RangeY = {range_y} mm: repeated B-scans, or a missing length; pass "
-            "spacing=(dx, dy) [mm] if they lie side by side."
-        )
-    return range_x / columns, range_y / ny
-
-
-def _depth(file: DataFile, applied: float) -> float:
-    if not file.ranges[2] or file.ranges[2] < 0:
-        raise MeasurementError(f"{file.stem} states no RangeZ; pass depth_spacing= [mm], as in air.")
-    return file.ranges[2] / file.shape[2] * applied

@@ -1,5 +1,6 @@
 """OCT volumes come back from every kind of file as they were, and what is wrong with a file is said in one line."""
 
+import json
 import re
 import shutil
 import zipfile
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 import tifffile
+from PIL import Image
 
 import opfem as op
 from tests.tolerances import ROUNDOFF
@@ -152,6 +154,45 @@ def test_complex_numbers_as_matlab_stores_them(tmp_path):
     assert read.phase_sign == 1
 
 
+def myoct(path, version=3, dtype=np.uint16, **change):
+    """A stack as myOCT writes it: pages of z by x, its JSON in the first page's tag 305."""
+    ny, nx, nz = SHAPE
+    levels = np.random.default_rng(5).integers(0, 2**16, (ny, nz, nx)).astype(dtype)
+    levels[0, 0, 0] = 0
+    grid = {axis: {"units": "millimeters", "values": (step * np.arange(n) - 0.02).tolist()}
+            for axis, step, n in (("x", 0.01, nx), ("y", 0.02, ny))}  # fmt: skip
+    grid["z"] = {"units": "microns", "values": (2.0 * np.arange(nz)).tolist()}
+    said = json.dumps({"metadata": grid, "clim": [-20.0, 45.534], "version": version} | change)
+    first, *rest = (Image.fromarray(page) for page in levels)
+    first.save(path, save_all=True, append_images=rest, compression="packbits", tiffinfo={305: said})
+    return levels
+
+
+def test_stack_of_myoct(tmp_path):
+    levels = myoct(tmp_path / "a.tif")
+    read = op.read_oct(tmp_path / "a.tif", index_applied=1.4)
+    expected = -20.0 + 1e-3 * (levels.astype(float) - 1.0)  # dB: 65.534 over 65534 steps
+    expected[0, 0, 0] = np.nan
+    np.testing.assert_allclose(read.values, np.moveaxis(expected, 1, 2), atol=1e-4)
+    np.testing.assert_allclose(read.spacing, (0.01, 0.02), rtol=1e-6)
+    np.testing.assert_allclose(read.optical_spacing, 1.4 * 2e-3, rtol=1e-6)
+    assert read.scale == "db"
+    with pytest.raises(op.MeasurementError, match="needs index_applied=: myOCT does not state"):
+        op.read_oct(tmp_path / "a.tif")
+    myoct(tmp_path / "b.tif", metadata=None)
+    with pytest.raises(op.MeasurementError, match=r"needs spacing=\(dx, dy\)"):
+        op.read_oct(tmp_path / "b.tif", index_applied=1.4)
+    stated = op.read_oct(tmp_path / "b.tif", spacing=0.01, depth_spacing=2e-3)
+    np.testing.assert_allclose(stated.values, read.values)
+    for message, change in (
+        ("myOCT's of version '2' in uint8", {"version": 2, "dtype": np.uint8}),
+        ("clim must be two numbers", {"clim": None}),
+    ):
+        myoct(tmp_path / "b.tif", **change)
+        with pytest.raises(op.MeasurementError, match=message):
+            op.read_oct(tmp_path / "b.tif")
+
+
 def test_what_is_not_stated_is_asked_for(tmp_path):
     np.save(tmp_path / "a.npy", samples())
     stated = {"order": "zxy", "scale": "db", "spacing": 0.01, "depth_spacing": 2.5e-3}
@@ -204,6 +245,20 @@ def test_cut_off_file(tmp_path):
         (tmp_path / "b.oct").write_bytes(whole[:size])
         with pytest.raises(op.MeasurementError, match=r"b\.oct: "):
             op.read_oct(tmp_path / "b.oct")
+
+
+def test_refusal_of_a_damaged_name_is_short(tmp_path):
+    """An entry whose name is said to be as long as the file is not quoted whole."""
+    op.write_oct(volume(), tmp_path / "a.oct")
+    path = rewritten(tmp_path / "a.oct", tmp_path / "b.oct", zipfile.ZIP_DEFLATED)
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        at = archive.getinfo("data\\Intensity.data").header_offset
+    content[at + 26 : at + 28] = (1500).to_bytes(2, "little")
+    path.write_bytes(content)
+    with pytest.raises(op.MeasurementError, match=r"BadZipFile: File name in directory .* …\)") as refusal:
+        op.read_oct(path)
+    assert len(str(refusal.value)) < 700
 
 
 def test_claims_beyond_memory_are_refused(tmp_path):
@@ -268,6 +323,91 @@ def test_linear_power_is_written_as_decibels(tmp_path):
     op.write_oct(written, tmp_path / "a.oct")
     read = op.read_oct(tmp_path / "a.oct")
     np.testing.assert_allclose(read.intensity(), written.values, rtol=1e-5)  # float32 of 16 dB
+
+
+def spectra(repeats=(1, 1), is_ascending=False):
+    """Whole counts of random scenes, on a chirped spectrometer of an odd number of pixels."""
+    rng = np.random.default_rng(4)
+    pixels = 45
+    even = np.linspace(0.0, 1.0, pixels)
+    reference = 2e4 * np.exp(-(((even - 0.45) / 0.3) ** 2)) + 0.3
+    counts = rng.integers(200, 60_000, (2 * repeats[0], 3 * repeats[1], pixels)).astype(np.uint16)
+    return op.Spectra(
+        counts, (0.01, 0.02), 5e-3, reference=reference, offset=100.0 + 10.0 * even,
+        chirp=(pixels - 1) * (even + 0.1 * even * (1 - even)), origin=(0.1, 0.2), wavelength=845e-6,
+        dispersion=(3.0, -1.5), is_ascending=is_ascending, repeats=repeats,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".oct"])
+@pytest.mark.parametrize("repeats", [(1, 1), (2, 3)])
+def test_written_spectra_come_back(tmp_path, suffix, repeats):
+    written = spectra(repeats)
+    op.write_oct(written, tmp_path / f"a{suffix}")
+    read = op.read_spectra(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(read.values, written.values)
+    # Thorlabs' files hold float32, and the reference as whole counts of 25 lines.
+    coarse = suffix == ".oct"
+    np.testing.assert_allclose(read.reference, written.reference, atol=0.02 if coarse else 0.0)
+    for name in ("offset", "chirp"):
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=1e-6 if coarse else 0.0)
+    for name in ("spacing", "origin", "optical_spacing", "wavelength", "dispersion"):
+        np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=ROUNDOFF)
+    assert (read.repeats, read.is_ascending, read.shape) == (repeats, False, (2, 3, 45))
+    volume, direct = op.read_oct(tmp_path / f"a{suffix}"), written.to_volume()
+    assert volume.scale == ("complex" if repeats == (1, 1) else "linear")
+    np.testing.assert_allclose(volume.values, direct.values, atol=1e-4 * np.abs(direct.values).max())
+
+
+def test_ascending_spectra_are_turned_round(tmp_path):
+    written = spectra(is_ascending=True)
+    op.write_oct(written, tmp_path / "a.oct")
+    op.write_oct(written, tmp_path / "a.h5")
+    turned, kept = op.read_oct(tmp_path / "a.oct"), op.read_oct(tmp_path / "a.h5")
+    assert (turned.phase_sign, kept.phase_sign) == (-1, 1)
+    top = np.abs(kept.values).max()
+    np.testing.assert_allclose(np.conj(turned.values), kept.values, atol=1e-3 * top)
+
+
+def test_counts_of_electrons_take_four_bytes(tmp_path):
+    few = spectra()
+    many = op.Spectra(
+        540.0 * few.values, few.spacing, few.optical_spacing, reference=540.0 * few.reference, chirp=few.chirp
+    )
+    op.write_oct(many, tmp_path / "a.oct")
+    np.testing.assert_array_equal(op.read_spectra(tmp_path / "a.oct").values, many.values)
+
+
+def test_repeats_in_a_header(tmp_path):
+    """Of one file: repeats that do not divide, all B-scans at one place, and what only the header names."""
+    op.write_oct(spectra((2, 3)), tmp_path / "a.oct")
+
+    def read(change):
+        return op.read_spectra(rewritten(tmp_path / "a.oct", tmp_path / "b.oct", header=change))
+
+    with pytest.raises(op.MeasurementError, match="has 9 A-lines, which averaging over 2 does not divide"):
+        read(lambda header: header.replace("<AScans>3<", "<AScans>2<"))
+    one_place = read(lambda header: re.sub('RangeY="[^"]*"', 'RangeY="-1"', header))
+    assert one_place.repeats == (4, 3)
+    assert one_place.to_volume().shape == (1, 3, 22)
+    speckle = "<SpeckleAveraging><FastAxis>3</FastAxis><SlowAxis>4</SlowAxis></SpeckleAveraging><RefractiveIndex>"
+    averaged = read(
+        lambda header: re.sub(r"<(AScans|BScans)>\d<", r"<\1>1<", header).replace("<RefractiveIndex>", speckle)
+    )
+    assert averaged.repeats == (4, 3)
+
+
+def test_repeated_lines_are_averaged_in_power():
+    """Speckle of a scatterer whose phase is another one each time neither fades nor stays."""
+    pixels, times = 256, 64
+    rng = np.random.default_rng(0)
+    place = np.arange(pixels)
+    turns = np.exp(2j * np.pi * rng.random((1, times, 1)))
+    fringes = (np.exp(2j * np.pi * 40 * place / pixels) * turns).real
+    counts = 1e4 * (1 + 0.1 * np.concatenate([fringes, 2 * fringes], axis=1))
+    read = op.Spectra(counts, 0.01, 5e-3, reference=np.full(pixels, 1e4), repeats=(1, times)).to_volume("none")
+    assert (read.shape, read.scale, read.phase_sign) == ((1, 2, 128), "linear", None)
+    np.testing.assert_allclose(read.values[0, :, 40], [0.05**2, 0.1**2], rtol=1e-5)
 
 
 def test_raw_spectra_of_a_thorlabs_file(tmp_path):

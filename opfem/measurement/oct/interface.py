@@ -172,7 +172,7 @@ def find_interface(
         spacing=volume.spacing,
         origin=volume.origin,
         noise_length=jnp.asarray(found.noise_length, float),
-        index=system.index,
+        index=jnp.asarray(system.index, float),  # of the precision that is asked for now
         steps=(*volume.steps, *steps),
     )
 

@@ -100,7 +100,7 @@ def search_volume(volume: OctVolume, system: OctSystem, options: Search) -> tupl
         noise_db=10.0 * math.log10(max(float(np.quantile(some, 0.05)) / 0.05, 1e-30)),
         noise_length=math.hypot(NOISE_WIDTH * options.average, float(system.lateral_fwhm)),
     )
-    steps = [Step("find_interface", index=system.index, average=options.average, max_slope=options.max_slope)]
+    steps = [Step("find_interface", index=float(system.index), average=options.average, max_slope=options.max_slope)]
     if lines is not None:
         steps.append(Step("lines", depth=origin + geometry.dz * np.flatnonzero(lines.is_line)))
     if clipped > _CLIPPED:

@@ -19,6 +19,8 @@ from ..._checks import check_positive
 from ..._types import ScalarLike
 from ..grid import bilinear
 from ..thickness import Step, ThicknessMap
+from .interferogram import interferograms
+from .spectra import Spectra
 from .system import OctSystem
 from .volume import OctVolume, Scale, power
 
@@ -69,7 +71,9 @@ def simulate_oct(
     specular: float | int | None = None,
     lines: Sequence[tuple[float, float]] = (),
     scale: Scale = "db",
-) -> OctVolume | tuple[OctVolume, OctVolume]:
+    spectra: bool = False,
+    dispersion: tuple[float, float] = (0.0, 0.0),
+) -> OctVolume | Spectra | tuple[OctVolume, OctVolume] | tuple[Spectra, Spectra]:
     """Simulate the volume that a microscope would measure, or two volumes before and after a small increment.
 
     Args:
@@ -87,15 +91,20 @@ def simulate_oct(
         specular: Power of the surface's own reflection over the sample's, where it is level [dB]; None has none.
         lines: (depth [mm], power over the sample's [dB]) of artefact lines at constant depth.
         scale: What a single volume holds.
+        spectra: Return what the camera of the spectrometer counts, with shot noise, in place of the volume. Shaped by
+            a Hann window, volumes of such spectra have 2 dB more noise than asked for.
+        dispersion: Second and third order of the phase [rad] of spectra at their ends.
 
     Returns:
-        The volume; with `increment`, the volumes before and after.
+        The volume or spectra; with `increment`, those before and after.
 
     Raises:
         ValueError: For spacings beyond half the resolution in depth, and an increment of more than 3 pixels.
     """
     check_positive("simulate_oct.spacing (dx, dy)", "mm", spacing)
     check_positive("simulate_oct.depth_spacing", "mm", depth_spacing)
+    if not spectra and any(dispersion):
+        raise ValueError("simulate_oct.dispersion [rad] is that of spectra; pass spectra=True as well.")
     if shape is None:
         if callable(surface) and not isinstance(surface, ThicknessMap):
             raise ValueError("simulate_oct.shape (ny, nx) is needed for a surface that is a function.")
@@ -111,7 +120,15 @@ def simulate_oct(
     for rows in scene.slabs():
         for field, slab in zip(fields, scene.speckle(key, rows), strict=True):
             field[rows] = slab
-    return scene.finished(fields, key, snr, specular, lines, scale if increment is None else "complex")
+    noise = scene.reflected(fields, specular, lines) * 10.0 ** (-snr / 20.0)
+    noise_key, step = jax.random.fold_in(key, 2**31 - 1), Step("simulated", snr=snr)
+    if spectra:
+        keys = [jax.random.fold_in(noise_key, state) for state in range(len(fields))]
+        states: Any = interferograms(fields, system, spacing, depth_spacing, noise, dispersion, keys, step)
+    else:
+        _add_noise(fields, noise, noise_key)
+        states = [scene.volume(field, scale if increment is None else "complex", step) for field in fields]
+    return states[0] if increment is None else tuple(states)
 
 
 class _Scene:
@@ -208,33 +225,26 @@ class _Scene:
                 moved = _spread(moved, move / step, axis)
         return moved
 
-    def finished(self, fields, key, snr, specular, lines, scale):
-        """Add what is not speckle: the surface's reflection, lines and noise."""
+    def reflected(
+        self, fields: list[np.ndarray], specular: float | None, lines: Sequence[tuple[float, float]]
+    ) -> float:
+        """Add the surface's reflection and lines; return the mean amplitude of the sample at its surface."""
         ny, nx = self.shape
         x, y = np.arange(nx) * self.spacing[0], np.arange(ny) * self.spacing[1]
         depth = np.asarray(self.surface(*np.meshgrid(x, y)), float)
         levels = np.arange(self.levels) * self.dz
         _, amplitude, fade, _, roll_off = self._numbers()
-        level = amplitude * np.exp(-fade * depth - roll_off * depth**2)  # of the sample's field at its surface
+        level = amplitude * np.exp(-fade * depth - roll_off * depth**2)
         extra = np.zeros(self.levels, np.complex64)
         for place, decibels in lines:
             extra += np.float32(level.mean() * 10.0 ** (decibels / 20.0)) * self._point(levels - place)
-        noise_key = jax.random.fold_in(key, 2**31 - 1)
-        noise = float(level.mean()) * 10.0 ** (-snr / 20.0)
-        volumes = []
         for state, field in enumerate(fields):
             moved = depth if state == 0 else depth + np.asarray(self._axial(x, y, depth))
             for j in range(ny):
                 field[j] += extra
                 if specular is not None:
                     field[j] += self._reflection(moved, level, levels, j, specular)
-                draw = jax.random.normal(
-                    jax.random.fold_in(noise_key, state * ny + j), (2, nx, self.levels), jnp.float32
-                )
-                real, imaginary = np.asarray(draw) * np.float32(noise / math.sqrt(2.0))
-                field[j] += real + 1j * imaginary
-            volumes.append(self._volume(field, scale, snr))
-        return volumes[0] if len(volumes) == 1 else tuple(volumes)
+        return float(level.mean())
 
     def _axial(self, x, y, depth):
         assert self.increment is not None
@@ -255,7 +265,8 @@ class _Scene:
         height = level[j] * 10.0 ** (specular / 20.0) * seen * np.exp(1j * wavenumber * depth[j])
         return (height[:, None] * self._point(levels - depth[j][:, None])).astype(np.complex64)
 
-    def _volume(self, field: np.ndarray, scale: Scale, snr: float | int) -> OctVolume:
+    def volume(self, field: np.ndarray, scale: Scale, step: Step) -> OctVolume:
+        """Make a volume of a finished field."""
         values: Any = field
         if scale != "complex":
             values = power(field, "complex")
@@ -268,8 +279,17 @@ class _Scene:
             scale,
             wavelength=self.system.wavelength,
             phase_sign=1 if scale == "complex" else None,
-            steps=(Step("simulated", snr=snr),),
+            steps=(step,),
         )
+
+
+def _add_noise(fields: list[np.ndarray], noise: float, key: PRNGKeyArray) -> None:
+    ny, nx, levels = fields[0].shape
+    for state, field in enumerate(fields):
+        for j in range(ny):
+            draw = jax.random.normal(jax.random.fold_in(key, state * ny + j), (2, nx, levels), jnp.float32)
+            real, imaginary = np.asarray(draw) * np.float32(noise / math.sqrt(2.0))
+            field[j] += real + 1j * imaginary
 
 
 def _gaussian(std: float) -> np.ndarray:

@@ -67,6 +67,18 @@ def test_same_key_same_bits_whatever_the_slabs(monkeypatch):
     assert not np.array_equal(speckle((12, 16), key=1).values, whole.values)
 
 
+def test_spectra_of_two_states():
+    """An increment makes spectra before and after, whose volumes turn the phase against its direction in them."""
+    how = {"spectra": True, "scale": "db", "increment": lambda x, y, z: (0.0, 0.0, 0.05e-3)}
+    before, after = speckle((8, 8), **how)
+    again, _ = speckle((8, 8), **how)
+    np.testing.assert_array_equal(before.values, again.values)
+    a, b = (np.asarray(spectra.to_volume("none").values)[..., 10:60] for spectra in (before, after))
+    turned = np.angle(np.vdot(a, b)) / (4 * np.pi * 1.4 / 845e-6)
+    assert before.to_volume().phase_sign == -1
+    assert turned == pytest.approx(-0.05e-3, abs=0.1e-6)
+
+
 def test_scales_agree():
     field, power, decibels = (speckle((8, 8), scale=scale) for scale in ("complex", "linear", "db"))
     np.testing.assert_allclose(field.intensity(), power.values, rtol=1e-5)
@@ -78,5 +90,7 @@ def test_what_cannot_be_simulated_is_refused():
         speckle((8, 8), increment=lambda x, y, z: (0.0, 0.0, 0.02))
     with pytest.raises(ValueError, match=r"depth_spacing \[mm\] must be at most half of axial_fwhm"):
         speckle((8, 8), depth_spacing=5e-3)
+    with pytest.raises(ValueError, match="is that of spectra; pass spectra=True"):
+        speckle((8, 8), dispersion=(3.0, 0.0))
     with pytest.raises(ValueError, match=r"shape \(ny, nx\) is needed"):
         op.simulate_oct(op.UWA_845NM, deep, key=jax.random.key(0), spacing=(DX, DX))

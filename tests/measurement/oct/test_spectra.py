@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import opfem as op
+from tests.measurement.oct.scenes import errors, simulated, waves
 
 PIXELS = 2048
 K = (2 * np.pi / 930e-6, 2 * np.pi / 830e-6)  # rad/mm, at the ends of the spectrum
@@ -71,3 +72,48 @@ def test_bad_spectra_are_refused():
         op.Spectra(good.values, 0.01, 2e-3, chirp=np.arange(PIXELS)[::-1])
     with pytest.raises(ValueError, match="one number a pixel, 2048, got shape"):
         op.Spectra(good.values, 0.01, 2e-3, reference=np.ones(5))
+
+
+def test_interface_in_the_file_of_simulated_spectra(tmp_path):
+    """A scene in raw spectra, with dispersion, written and read, has its interface where the volume has it."""
+    surface = waves(0.16)
+    direct = simulated(surface, seed=1, scale="complex")
+    recorded = simulated(surface, seed=1, spectra=True, dispersion=(20.0, 5.0))
+    for suffix in (".h5", ".oct"):
+        op.write_oct(recorded, tmp_path / f"a{suffix}")
+    stored, volume = (op.read_oct(tmp_path / f"a{suffix}") for suffix in (".h5", ".oct"))
+    np.testing.assert_allclose(volume.values, stored.values, atol=1e-4 * np.abs(stored.values).max())
+    assert volume.shape == direct.shape
+    assert volume.phase_sign == -1
+    one, other = (op.find_interface(v, op.UWA_845NM, edge="brighter") for v in (volume, direct))
+    moved = np.asarray(one.depth - other.depth)
+    assert abs(moved.mean()) < 0.5e-3  # a Hann window is not the Gaussian of the system
+    assert moved.std() < 0.5 * np.median(other.std)  # the same speckle, other noise
+    error, std = errors(one, surface)
+    assert abs(error.mean()) < 0.4e-3
+    assert 0.8 < np.sqrt(np.mean((error / std) ** 2)) < 1.25
+
+
+def test_spectra_shaped_as_the_light_give_the_volume():
+    """Without a window the axial resolution is the system's: the field is that of the volume, to its noise."""
+    direct, recorded = (
+        simulated(waves(0.16), seed=1, snr=50.0, **how) for how in ({"scale": "complex"}, {"spectra": True})
+    )
+    assert recorded.values.dtype == np.uint16
+    field = np.conj(recorded.to_volume("none").values)[..., 12:110]  # resampling loses fringes beyond
+    expected = np.asarray(direct.values)[..., 12:110]
+    scale = np.vdot(expected, field) / np.vdot(expected, expected)
+    left = np.abs(field / scale - expected) ** 2
+    assert abs(np.angle(scale)) < 0.05  # the centroid of lit pixels lies 0.02 pixels beside the centre
+    assert left.mean() < 2e-3 * np.mean(np.abs(expected) ** 2)
+
+
+def test_noise_of_spectra():
+    """Far from the sample a volume has the noise that was asked for."""
+    common = {"media": (op.Medium(-90.0, 0.0), op.Medium(0.0, 0.0)), "snr": 20.0}
+    surface = waves(0.0, depth=0.12)  # resampling loses little so near
+    direct, recorded = (simulated(surface, **how, **common) for how in ({"scale": "linear"}, {"spectra": True}))
+    power = recorded.to_volume("none").intensity()
+    sample, dark = slice(56, 76), slice(16, 36)
+    ratios = [p[..., sample].mean() / p[..., dark].mean() for p in (power, direct.values)]
+    assert 10 * np.log10(ratios[0] / ratios[1]) == pytest.approx(0.0, abs=0.2)
