@@ -5,7 +5,7 @@ Displacement alone, or displacement and the elements' mean stress: a saddle poin
 """
 
 import itertools
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ class Unknowns(NamedTuple):
         return self._replace(mean_stress=jax.tree.map(lambda stress: scale * stress, self.mean_stress))
 
 
+@runtime_checkable
 class AbstractTangent(Protocol):
     """The linear operator of one Newton step, in float32, and its preconditioner."""
 
