@@ -90,15 +90,19 @@ from .plot import (
     plot_uncertainty as plot_uncertainty,
 )
 from .results import (
+    Comparison as Comparison,
     OctScene as OctScene,
+    compare as compare,
     layer_fields as layer_fields,
     oct_scene as oct_scene,
+    sample_fields as sample_fields,
     summary as summary,
     to_xarray as to_xarray,
 )
 from .solvers import (
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,
+    ExperimentSolution as ExperimentSolution,
     Explicit as Explicit,
     Newton as Newton,
     Solution as Solution,
