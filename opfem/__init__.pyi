@@ -79,12 +79,14 @@ from .model import (
     Yeoh as Yeoh,
 )
 from .plot import (
+    plot_comparison as plot_comparison,
     plot_fit as plot_fit,
     plot_interface as plot_interface,
     plot_layer as plot_layer,
     plot_pressure as plot_pressure,
     plot_report as plot_report,
     plot_residual as plot_residual,
+    plot_section as plot_section,
     plot_status as plot_status,
     plot_thickness as plot_thickness,
     plot_uncertainty as plot_uncertainty,
