@@ -96,6 +96,7 @@ from .results import (
     OctScene as OctScene,
     compare as compare,
     layer_fields as layer_fields,
+    measured_thickness as measured_thickness,
     oct_scene as oct_scene,
     sample_fields as sample_fields,
     summary as summary,

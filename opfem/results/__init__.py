@@ -5,6 +5,7 @@ from ..solvers import ExperimentSolution, Solution
 from .compare import Comparison, FieldMetrics, compare
 from .dataset import to_xarray
 from .interior import LayerFields, layer_fields, sample_fields
+from .measured import measured_thickness
 from .oct_scene import OctScene, oct_scene
 from .summary import summary, summary_rows
 
@@ -18,6 +19,7 @@ __all__ = [
     "TractionFit",
     "compare",
     "layer_fields",
+    "measured_thickness",
     "oct_scene",
     "sample_fields",
     "summary",
