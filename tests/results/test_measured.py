@@ -22,7 +22,7 @@ def test_thickness_is_read_where_the_interface_lies_now(truth):
     x, y, z = np.asarray(truth.positions + truth.displacement)[:, -1, 1:-1, 1:-1]
     own = z - np.asarray(truth.displacement[2, 0, 1:-1, 1:-1])
     np.testing.assert_allclose(
-        measured.sample(jnp.asarray(x), jnp.asarray(y)), own, atol=2e-5
+        measured.sample(jnp.asarray(x), jnp.asarray(y)), own, atol=5e-5
     )  # half a pixel across a kink of the surface by 0.1
 
 
