@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 
 from .._checks import concrete
 from ..inverse import FitStatus, TractionFit
@@ -17,7 +16,7 @@ from ..model import Imprint
 from ..solvers import CONVERGED, RESULTS, ExperimentSolution, FaceResult, Solution
 from ..solvers.solution import OPEN, is_failure
 from .bodies import SAMPLE_NODES, interior_variables, sample_coordinates, sample_record, sample_variables
-from .fields import under_pixels
+from .fields import pressure_image
 from .interior import layer_fields
 from .labels import NODES, Variable, variable
 from .provenance import describe, inputs_hash, steps_as_json, versions
@@ -227,15 +226,13 @@ def _face(
 
 def _image(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
     grid = solution.thickness
-    y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")
     outside = np.asarray(grid.mask)
-    pressure = _pressure_image(solution, x, y)
     images = {
         "thickness": variable(
             IMAGE, np.where(outside, np.nan, grid.values), "mm", "computed thickness of the loaded layer"
         ),
         "pressure_image": variable(
-            IMAGE, np.where(outside, np.nan, pressure), "MPa", "contact pressure at the sample under each pixel"
+            IMAGE, pressure_image(solution), "MPa", "contact pressure at the sample under each pixel"
         ),
     }
     if isinstance(solution.load, Imprint):
@@ -243,15 +240,6 @@ def _image(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
         images["imposed_thickness"] = variable(IMAGE, given.values, "mm", "thickness map that was pressed in")
         images["missing"] = variable(IMAGE, given.mask, "1", "pixels of that map that hold no measured data")
     return images
-
-
-def _pressure_image(
-    solution: Solution | ExperimentSolution, x: Float[np.ndarray, "my mx"], y: Float[np.ndarray, "my mx"]
-) -> Float[np.ndarray, "my mx"]:
-    lateral = np.asarray(solution.displacement[:2, -1])
-    if not np.isfinite(lateral).all():
-        return np.full(x.shape, np.nan)
-    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)
 
 
 def _fit(fit: TractionFit) -> dict[str, Variable]:
