@@ -79,26 +79,33 @@ from .model import (
     Yeoh as Yeoh,
 )
 from .plot import (
+    plot_comparison as plot_comparison,
     plot_fit as plot_fit,
     plot_interface as plot_interface,
     plot_layer as plot_layer,
     plot_pressure as plot_pressure,
     plot_report as plot_report,
     plot_residual as plot_residual,
+    plot_section as plot_section,
     plot_status as plot_status,
     plot_thickness as plot_thickness,
     plot_uncertainty as plot_uncertainty,
 )
 from .results import (
+    Comparison as Comparison,
     OctScene as OctScene,
+    compare as compare,
     layer_fields as layer_fields,
+    measured_thickness as measured_thickness,
     oct_scene as oct_scene,
+    sample_fields as sample_fields,
     summary as summary,
     to_xarray as to_xarray,
 )
 from .solvers import (
     RESULTS as RESULTS,
     ConvergenceError as ConvergenceError,
+    ExperimentSolution as ExperimentSolution,
     Explicit as Explicit,
     Newton as Newton,
     Solution as Solution,

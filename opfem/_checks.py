@@ -74,7 +74,9 @@ def _number(field: str, unit: str, value: Any, holds, expected: str) -> None:
 def check_modulus(field: str, unit: str, value: Any) -> None:
     """Raise ValueError unless the value is positive, infinite included, or traced."""
     known = concrete(value)
-    if known is None or known.dtype.kind != "f" or not np.all(known == np.inf):
+    if known is not None and known.dtype.kind == "f":
+        value = known[known != np.inf]
+    if known is None or np.size(value):
         _number(field, unit, value, lambda v: v > 0, "positive, or jnp.inf for incompressible")
 
 

@@ -18,7 +18,7 @@ matplotlib.use("agg")
 
 # After the hook, which checks only what is imported later.
 import opfem as op  # noqa: E402
-from tests.experiments import EXTENT, L0, PIXELS, published_palpation  # noqa: E402
+from tests.experiments import EXTENT, L0, PIXELS, inclusion_experiment, published_palpation  # noqa: E402
 from tests.sharding import (  # noqa: E402
     pytest_addoption as pytest_addoption,
     pytest_collection_modifyitems as pytest_collection_modifyitems,
@@ -75,6 +75,15 @@ def loaded():
 def solution(loaded):
     """The bump pressed into a 2 × 2 mm layer on 6 × 6 × 2 elements, with friction on both sides."""
     return op.solve(published_palpation(), op.Imprint(loaded))
+
+
+@pytest.fixture(scope="session")
+def truth():
+    """The small virtual experiment, pressed by 0.2 mm."""
+    jaxtyping.config.update("jaxtyping_disable", True)  # XXX until solvers' annotations know experiments
+    solved = op.solve(inclusion_experiment(), op.Compression(0.2))
+    jaxtyping.config.update("jaxtyping_disable", False)
+    return solved
 
 
 @pytest.fixture(scope="session")

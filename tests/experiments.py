@@ -40,6 +40,17 @@ def published_palpation(
     )
 
 
+INCLUSION = op.Cylinder(centre=(0.8, 1.1), radius=0.45, depth=(0.2, 0.7))
+
+
+def inclusion_experiment(**changes) -> op.Experiment:
+    """State a small virtual experiment: a stiff cylinder in a soft sample under the published layer."""
+    sample = op.Sample(1.0, op.NeoHooke(3e-3, 0.12)).with_inclusion(INCLUSION, op.NeoHooke(2e-2, 0.8))
+    given = {"layer": op.Layer(L0, MATERIAL), "sample": sample, "extent": EXTENT, "elements": ((6, 6, 2), (5, 5, 4))}
+    given |= {"window": op.Contact(HARD, 0.15), "interface": op.Contact(EXPONENTIAL, 0.05)}
+    return op.Experiment(**(given | {"plate": op.Contact(HARD, 0.15)} | changes))
+
+
 def bumpy_map(depth: float = 0.08, tilt: float = 0.0) -> op.ThicknessMap:
     """Press one bump off centre [mm] into the layer, on top of 0.03 mm; a tilt pushes the layer sideways."""
     x, y = np.meshgrid(*(np.linspace(0.0, SIDE, n) for n in reversed(PIXELS)))

@@ -12,6 +12,7 @@ import scipy.io
 
 import opfem as op
 from opfem.cli import main
+from opfem.cli.scene import read_scene
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -34,7 +35,7 @@ def own_map(tmp_path, monkeypatch):
 
 
 def test_python(own_map):
-    found, code, _, swept = blocks("python")
+    found, code, _, _, swept = blocks("python")
     names = {"op": op}
     exec(compile(found, "README.md", "exec"), names)
     assert float(names["loaded"].std.max()) < 0.01
@@ -50,7 +51,7 @@ def test_python(own_map):
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_fit(own_map):
-    _, code, fitted, _ = blocks("python")
+    _, code, fitted, _, _ = blocks("python")
     assert "(40, 40, 4)" in code  # which takes minutes on 2 cores
     names = {}
     exec(compile(code.replace("(40, 40, 4)", "(20, 20, 2)") + fitted, "README.md", "exec"), names)
@@ -58,8 +59,28 @@ def test_fit(own_map):
     plt.close("all")
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_virtual_experiment(own_map):
+    _, code, _, virtual, _ = blocks("python")
+    names = {}
+    exec(compile(code.replace("(40, 40, 4)", "(16, 16, 2)") + virtual, "README.md", "exec"), names)
+    assert names["compared"].relative_error < 0.1
+    assert names["compared"].truth.contrast > 1.1
+    plt.close("all")
+
+
+def test_scene_states_the_same_experiment(own_map):
+    scene, _ = blocks("toml")
+    Path("scene.toml").write_text(scene, encoding="utf-8")
+    _, code, _, virtual, _ = blocks("python")
+    names = {}
+    exec(compile(code.split("data =")[0] + virtual.split("truth =")[0], "README.md", "exec"), names)
+    assert repr(read_scene(Path("scene.toml")).experiment) == repr(names["experiment"])
+
+
 def test_sweep_file(own_map, tmp_path):
-    (config,) = blocks("toml")
+    _, config = blocks("toml")
     Path("sweep.toml").write_text(config, encoding="utf-8")
     with pytest.raises(SystemExit) as end:
         main(["sweep", "sweep.toml", "--out", "swept"])

@@ -137,6 +137,32 @@ def sweep(
 
 
 @app.command
+def simulate(
+    scene: Annotated[
+        Path,
+        Parameter(
+            name="SCENE",
+            help="A .toml file with [layer], [sample], [[inclusion]], [experiment], [window], [interface], [plate], "
+            "[compression] and [measurement]; the README shows one.",
+        ),
+    ],
+    /,
+    *,
+    out: _Out,
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
+
+    Writes map.npz, which palpate and fit take with its noise, result.nc and result.vtu (the truth), summary.json,
+    section.png and report.png; l0.npz where the layer's thickness is a map.
+    """
+    from .simulate import simulate
+
+    with reporting(run.debug):
+        simulate(scene, out, run)
+
+
+@app.command
 def oct(
     loaded: Annotated[
         str, Parameter(name="LOADED", help="OCT volume of the loaded layer: .oct, .h5, .mat, .npy, .tif, raw.")

@@ -15,7 +15,7 @@ from ..model import Contact, MooneyRivlin, Palpation
 from ..results import summary, to_xarray
 from ..solvers import Newton
 from ..solvers.progress import Progress
-from .folder import prepare, settle, write_result
+from .folder import EXAMPLE, prepare, settle, write_result
 from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions, StepOptions
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
@@ -81,7 +81,7 @@ def fit(
         dataset = to_xarray(fitted)
         figures = draw_fit(dataset, measured)
         progress.stage("writing")
-        example = measured if map == "example" else None
+        example = {EXAMPLE: measured} if map == "example" else {}
         files = write_result(dataset, figures, {**numbers, "settings": settings}, out, example)
     _show(numbers, files, out)
 

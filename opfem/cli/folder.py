@@ -6,8 +6,9 @@ A link is followed where it is the folder, and refused where it is a file of a r
 import io
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import xarray as xr
@@ -19,8 +20,10 @@ from ..sweeps.store import PLAN
 # The mark of a finished result comes last: a folder that holds it holds a whole result.
 FINISHED = "result.nc"
 EXAMPLE = "example_map.npz"
-# All that `palpate` and `fit` write.
-RESULT = (EXAMPLE, "result.vtu", "pressure.png", "report.png", "fit.png", "summary.json", FINISHED)
+SIMULATED, UNLOADED = "map.npz", "l0.npz"
+_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png")
+# All that `palpate`, `fit` and `simulate` write.
+RESULT = (EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_PICTURES, "summary.json", FINISHED)
 
 
 def settle(out: Path, force: bool) -> None:
@@ -68,7 +71,7 @@ def write_result(
     figures: dict[str, Any],
     numbers: dict[str, Any],
     out: Path,
-    example: ThicknessMap | None = None,
+    maps: Mapping[str, ThicknessMap] = MappingProxyType({}),
 ) -> list[str]:
     """Write every file of a result: all are complete before one of an old result is replaced.
 
@@ -77,12 +80,12 @@ def write_result(
         figures: Matplotlib figures by file name.
         numbers: For summary.json.
         out: Folder of the results.
-        example: The built-in map, where that was measured.
+        maps: Thickness maps by file name: the built-in one where that was measured, or those that were simulated.
 
     Returns:
         The names of the files.
     """
-    contents: dict[str, Any] = {} if example is None else {EXAMPLE: _thickness_bytes(example)}
+    contents: dict[str, Any] = {name: _thickness_bytes(thickness) for name, thickness in maps.items()}
     contents["result.vtu"] = vtu_bytes(dataset)
     for name, figure in figures.items():
         picture = io.BytesIO()

@@ -13,7 +13,7 @@ from ..model import Imprint
 from ..results import summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, Explicit, Newton, Solution, solve
 from ..solvers.progress import Progress
-from .folder import FINISHED, prepare, record_failure, settle, write_result
+from .folder import EXAMPLE, FINISHED, prepare, record_failure, settle, write_result
 from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
@@ -94,7 +94,7 @@ def write_results(
         numbers = {**summary(solution), "settings": settings}
         figures = draw_pictures(dataset, measured)
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, out, measured if is_example else None)
+        return write_result(dataset, figures, numbers, out, {EXAMPLE: measured} if is_example else {})
 
 
 def _solver(options: SolverOptions) -> Newton | Explicit:

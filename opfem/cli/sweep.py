@@ -5,12 +5,10 @@ The file says what `opfem palpate` would be told, which of its numbers vary, and
 
 import dataclasses
 import shutil
-import tomllib
-import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -32,6 +30,7 @@ from .folder import prepare, refuse_links
 from .messages import in_options, validators
 from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions
 from .statement import configure_jax, read_maps, state_experiment, state_palpation
+from .toml_file import converted, read_toml
 
 # All that a sweep writes, the mark of a finished one last.
 RESULT = (POINTS, PLAN, FINISHED)
@@ -120,12 +119,7 @@ def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
 
 def _read(config: Path) -> dict[str, Any]:
     """Read a file and check the names of what it holds."""
-    try:
-        stated = tomllib.loads(config.read_text(encoding="utf-8-sig"))
-    except OSError as cause:
-        raise ValueError(f"Cannot read {config}: {cause.strerror}.") from cause
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
-        raise ValueError(f"{config} is not TOML: {cause}.") from cause
+    stated = read_toml(config)
     for section, entries in stated.items():
         known_name(f"{config}: section", section, _SECTIONS)
         if not isinstance(entries, dict):
@@ -176,7 +170,7 @@ def _keep(names: Any) -> list[str]:
 
 def _execution(stated: Mapping[str, Any]) -> Batch:
     hints: dict[str, Any] = {"size": int, "mode": str, "threads": int}
-    given = {name: _converted(f"[execution] {name}", hints[name], value) for name, value in stated.items()}
+    given = {name: converted(f"[execution] {name}", hints[name], value) for name, value in stated.items()}
     try:
         return Batch(**given)
     except ValueError as cause:
@@ -196,7 +190,7 @@ def _points(axes: Mapping[str, Any], design: Mapping[str, Any]) -> Points:
             raise ValueError(f"[design] {drawn[0]} is for kind sobol and latin_hypercube, got kind {kind!r}.")
         values = {name: _checked(name, _values(name, axis) * _factor(name, axis)) for name, axis in axes.items()}
         return (grid if kind == "grid" else zip_)(values).with_units(units)
-    count, seed = (_converted(f"[design] {name}", int, design.get(name, 0)) for name in ("points", "seed"))
+    count, seed = (converted(f"[design] {name}", int, design.get(name, 0)) for name in ("points", "seed"))
     if count < 1:
         raise ValueError(f"[design] points must be a whole number of at least 1, got {count}.")
     if seed < 0:
@@ -222,7 +216,7 @@ def _values(name: str, axis: Any) -> np.ndarray:
         return _numbers(name, axis["values"])
     if isinstance(axis, dict) and {"from", "to", "points"} <= set(axis) <= {"from", "to", "points", "log", "unit"}:
         low, high = _numbers(name, [axis["from"], axis["to"]])
-        count = _converted(f"[axes] {name} points", int, axis["points"])
+        count = converted(f"[axes] {name} points", int, axis["points"])
         if count < 1:
             raise ValueError(f"[axes] {name} points must be a whole number of at least 1, got {count}.")
         log = _is_log(name, axis)
@@ -236,13 +230,13 @@ def _values(name: str, axis: Any) -> np.ndarray:
 
 
 def _is_log(name: str, axis: Mapping[str, Any]) -> bool:
-    return _converted(f"[axes] {name} log", bool, axis.get("log", False))
+    return converted(f"[axes] {name} log", bool, axis.get("log", False))
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:
     if not isinstance(values, list):
         raise ValueError(f"[axes] {name} must hold a list of numbers, got {values!r}.")
-    array = np.array([_converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
+    array = np.array([converted(f"[axes] {name} [{_AXES[name].unit}]", float, value) for value in values])
     return array if np.isfinite(array).all() else _checked(name, array)  # before numbers are made of infinity
 
 
@@ -272,7 +266,7 @@ def _inputs(stated: Mapping[str, Any], points: Points, folder: Path) -> _Inputs:
             raise ValueError(f"[inputs] {name} is also one of the [axes]. Leave one out.")
         if name in ("l0", "missing") and isinstance(value, int | float) and not isinstance(value, bool):
             value = str(value)
-        value = _converted(f"[inputs] {name}", _plain(hints[name]), value)
+        value = converted(f"[inputs] {name}", _plain(hints[name]), value)
         given[name] = _path(value, folder) if name in ("l0", "map", "mask") else value
         for check in getattr(hints[name], "__metadata__", ()):
             _check(f"[inputs] {name}", validators(check.validator), given[name])
@@ -304,40 +298,6 @@ def _group(kind: type[_Options], given: Mapping[str, Any]) -> _Options:
 def _path(name: str, folder: Path) -> str:
     """Read paths as seen from the file that names them."""
     return str(folder / name) if (folder / name).is_file() else name
-
-
-def _converted(what: str, hint: Any, value: Any) -> Any:
-    """Convert a value of TOML to the type of an option; raise ValueError where it is of another."""
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for choice in choices:
-        parts = typing.get_args(choice)
-        if typing.get_origin(choice) is Literal:
-            if value in parts:
-                return value
-        elif typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
-            items = value if isinstance(value, list) else [value]
-            return tuple(_converted(what, parts[0], item) for item in items)
-        elif typing.get_origin(choice) is tuple:
-            if isinstance(value, list) and len(value) == len(parts):
-                return tuple(_converted(what, part, item) for part, item in zip(parts, value, strict=True))
-        elif choice is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-        elif choice is not float and type(value) is choice:
-            return value
-    expected = " or ".join(filter(None, map(_in_words, choices)))
-    raise ValueError(f"{what} must be {expected}, got {value!r}.")
-
-
-def _in_words(choice: Any) -> str:
-    """Name a type as TOML's users do."""
-    parts = typing.get_args(choice)
-    if typing.get_origin(choice) is Literal:
-        return "one of " + ", ".join(map(str, parts))
-    if typing.get_origin(choice) is tuple and parts[-1] is Ellipsis:
-        return f"{_in_words(parts[0])}, or a list of such"
-    if typing.get_origin(choice) is tuple:
-        return f"a list of {len(parts)}, each {_in_words(parts[0])}"
-    return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(choice, "")
 
 
 def _function(inputs: _Inputs, points: Points) -> Callable[..., Solution]:

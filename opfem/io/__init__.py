@@ -6,10 +6,11 @@ from .checkpoint import Checkpoint as Checkpoint
 from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
 from .oct import read_oct, read_spectra, write_oct
 from .thickness import read_thickness, write_thickness
-from .vtk import layer_grid, vtu_bytes, write_pvd, write_vtu
+from .vtk import bodies_grid, layer_grid, vtu_bytes, write_pvd, write_vtu
 
 __all__ = [
     "MeasurementError",
+    "bodies_grid",
     "finish",
     "layer_grid",
     "netcdf_bytes",

@@ -1,5 +1,6 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
+from .experiment import draw_simulation, plot_comparison, plot_section
 from .maps import (
     draw_fit,
     draw_pictures,
@@ -18,12 +19,15 @@ __all__ = [
     "draw_fit",
     "draw_interface",
     "draw_pictures",
+    "draw_simulation",
+    "plot_comparison",
     "plot_fit",
     "plot_interface",
     "plot_layer",
     "plot_pressure",
     "plot_report",
     "plot_residual",
+    "plot_section",
     "plot_status",
     "plot_thickness",
     "plot_uncertainty",

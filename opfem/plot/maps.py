@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch
 
 from ..measurement import ThicknessMap
-from ..results import Solution, TractionFit, to_xarray
+from ..results import ExperimentSolution, Solution, TractionFit, to_xarray
 
 _KPA = 1e3
 _UM = 1e3
@@ -30,7 +30,7 @@ STATUS_COLOURS = {"open": "#f0f0f0", "stick": "#0072b2", "slip": "#e69f00"}
 
 
 def plot_pressure(
-    data: Solution | xr.Dataset,
+    data: Solution | ExperimentSolution | xr.Dataset,
     ax: Axes | None = None,
     *,
     window: bool = False,
@@ -63,7 +63,9 @@ def plot_pressure(
     return ax
 
 
-def plot_status(data: Solution | xr.Dataset, ax: Axes | None = None, *, window: bool = False) -> Axes:
+def plot_status(
+    data: Solution | ExperimentSolution | xr.Dataset, ax: Axes | None = None, *, window: bool = False
+) -> Axes:
     """Draw where the layer is open, sticks or slips, on the current positions of the interface.
 
     Oriented as MATLAB's imagesc: row 0 at the top. The key beside it names the states and their shares.
@@ -109,7 +111,11 @@ def plot_thickness(
 
 
 def plot_residual(
-    data: Solution | xr.Dataset, measured: ThicknessMap | None = None, ax: Axes | None = None, *, cmap: str = "cividis"
+    data: Solution | ExperimentSolution | xr.Dataset,
+    measured: ThicknessMap | None = None,
+    ax: Axes | None = None,
+    *,
+    cmap: str = "cividis",
 ) -> Axes:
     """Draw measured less computed thickness [µm]; pixels without data or interface are hatched grey.
 
@@ -135,7 +141,7 @@ def plot_residual(
 
 
 def plot_report(
-    data: Solution | xr.Dataset, measured: ThicknessMap | None = None, figure: Figure | None = None
+    data: Solution | ExperimentSolution | xr.Dataset, measured: ThicknessMap | None = None, figure: Figure | None = None
 ) -> np.ndarray:
     """Draw what a palpation rests on: measured thickness, pressure, contact status, residual of thickness.
 
@@ -259,7 +265,7 @@ def draw_fit(data: xr.Dataset, measured: ThicknessMap) -> dict[str, Figure]:
     return {"pressure.png": pressure, "fit.png": report}
 
 
-def _converged(data: Solution | TractionFit | xr.Dataset) -> xr.Dataset:
+def _converged(data: Solution | ExperimentSolution | TractionFit | xr.Dataset) -> xr.Dataset:
     dataset = data if isinstance(data, xr.Dataset) else to_xarray(data)
     if not np.isfinite(dataset["pressure"].values).all():
         status = dataset.attrs.get("status")

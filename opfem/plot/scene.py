@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from ..io import layer_grid
-from ..results import Solution, to_xarray
+from ..results import ExperimentSolution, Solution, to_xarray
 
 if TYPE_CHECKING:
     import pyvista
@@ -14,7 +14,7 @@ _KPA = 1e3
 
 
 def plot_layer(
-    data: Solution | xr.Dataset,
+    data: Solution | ExperimentSolution | xr.Dataset,
     plotter: "pyvista.Plotter | None" = None,
     *,
     colour: str = "pressure",

@@ -9,18 +9,18 @@ from typing import Any
 import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 
 from .._checks import concrete
 from ..inverse import FitStatus, TractionFit
 from ..model import Imprint
-from ..solvers import CONVERGED, RESULTS, FaceResult, Solution
+from ..solvers import CONVERGED, RESULTS, ExperimentSolution, FaceResult, Solution
 from ..solvers.solution import OPEN, is_failure
-from .fields import under_pixels
+from .bodies import SAMPLE_NODES, interior_variables, sample_coordinates, sample_record, sample_variables
+from .fields import pressure_image
 from .interior import layer_fields
+from .labels import NODES, Variable, variable
 from .provenance import describe, inputs_hash, steps_as_json, versions
 
-NODES = ("y", "x")
 IMAGE = ("y_image", "x_image")
 NOT_CONVERGED = -1
 """Contact status where the solve failed."""
@@ -72,15 +72,23 @@ FIT_STATS = {
     "representation_rms": ("mm", "root mean square of what the map has beyond mesh-spaced splines"),
     "misfit_rms": ("mm", "root mean square of interface minus measured surface"),
 }
-Variable = tuple[tuple[str, ...], Any, dict[str, Any]]
+EXPERIMENT_STATS = {
+    "strain_energy": ("N mm", "strain energy of layer and sample"),
+    "force_plate": ("N", "force of the plate on the sample"),
+    "force_hold": ("N", "force of the in-plane hold on layer and sample"),
+    "work_plate": ("N mm", "work of the plate on the sample"),
+    "min_volume_ratio": ("1", "smallest volume ratio J in layer and sample"),
+}
 
 
-def to_xarray(solution: Solution | TractionFit, *, interior: bool = False) -> xr.Dataset:
+def to_xarray(solution: Solution | ExperimentSolution | TractionFit, *, interior: bool = False) -> xr.Dataset:
     """Label a solution, or a fit: dims, positions, units, and how it was made.
 
     Everything is in mm, N and MPa. Interface nodes are `y`, `x`; `x_current` and `y_current` say where
     they have moved. `thickness` and `pressure_image` are on the pixels of the load's map, NaN where no
     interface point lies under a pixel. Fields of a failed solve are NaN, its `contact_status` -1.
+    Of an experiment these are the layer's, on pixels at its nodes; names of the sample's fields begin with
+    `sample_`, of those at the plate with `plate_`, on nodes `y_sample`, `x_sample`.
 
     Args:
         solution: One solution or fit, outside jit. A fit adds `pressure_std`, `normal_std`, `residual` and what
@@ -106,26 +114,30 @@ def to_xarray(solution: Solution | TractionFit, *, interior: bool = False) -> xr
     failed = status_name(solution) not in CONVERGED
     variables = {
         **_volume(solution),
-        **_face("", "at the sample", solution.sample, failed),
+        **_face("", "at the sample", solution.interface, failed),
         **_face("window_", "at the window", solution.window, failed),
         **_image(solution),
-        **_stats(solution.stats, STATS),
-        **(_interior(solution) if interior else {}),
+        **_stats(solution.stats, STATS if isinstance(solution, Solution) else STATS | EXPERIMENT_STATS),
+        **(interior_variables(layer_fields(solution)) if interior else {}),
     }
     coordinates = _coordinates(solution)
-    if interior:
+    if isinstance(solution, ExperimentSolution):
+        variables |= _face("plate_", "at the plate", solution.plate, failed, "sample", SAMPLE_NODES[1:])
+        variables |= sample_variables(solution, interior)
+        coordinates |= sample_coordinates(solution)
+    if interior or isinstance(solution, ExperimentSolution):
         coordinates["direction"] = (("direction",), np.array(["x", "y", "z"]), {"long_name": "direction of a face"})
     return xr.Dataset(variables, coords=coordinates, attrs=_record(solution))
 
 
-def status_name(solution: Solution) -> str:
+def status_name(solution: Solution | ExperimentSolution) -> str:
     """Name how a solve ended, as a member of `RESULTS`."""
     # Equinox offers no other way from an item to its name.
     names = RESULTS._name_to_item
     return next(name for name, item in names.items() if bool(item == solution.result))
 
 
-def status_message(solution: Solution) -> str:
+def status_message(solution: Solution | ExperimentSolution) -> str:
     """Say in words how a solve ended; empty when all is well."""
     message = RESULTS[solution.result]
     if status_name(solution) == "material_unstable":
@@ -139,13 +151,13 @@ def status_message(solution: Solution) -> str:
     return message
 
 
-def touches_nowhere(solution: Solution) -> bool:
+def touches_nowhere(solution: Solution | ExperimentSolution) -> bool:
     """Tell whether an imprint has reached its full depth without contact anywhere."""
     imprinted = isinstance(solution.load, Imprint) and not bool(is_failure(solution.result))
     return imprinted and not np.any(np.asarray(solution.contact_status) != OPEN)
 
 
-def _require_one(solution: Solution) -> None:
+def _require_one(solution: Solution | ExperimentSolution) -> None:
     if any(concrete(leaf) is None for leaf in jax.tree.leaves(solution)):
         raise ValueError("to_xarray needs known numbers, got a traced solution. Call it outside jit, grad and vmap.")
     if solution.displacement.ndim != 4:
@@ -155,36 +167,32 @@ def _require_one(solution: Solution) -> None:
         )
 
 
-def _variable(dims: tuple[str, ...], values: Any, units: str, long_name: str, **attrs: Any) -> Variable:
-    return dims, np.asarray(values), {"units": units, "long_name": long_name, **attrs}
-
-
-def _coordinates(solution: Solution) -> dict[str, Variable]:
+def _coordinates(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
     X = np.asarray(solution.positions[:2, -1])
     current = X + np.asarray(solution.displacement[:2, -1])
     x, y = X[0, 0], X[1, :, 0]
     layers = solution.positions.shape[1] - 1
     grid = solution.thickness
     return {
-        "x": _variable(("x",), x, "mm", "reference position along image columns"),
-        "y": _variable(("y",), y, "mm", "reference position along image rows"),
-        "z": _variable(("z",), np.arange(layers + 1) / layers, "1", "height over unloaded thickness, 0 at the window"),
+        "x": variable(("x",), x, "mm", "reference position along image columns"),
+        "y": variable(("y",), y, "mm", "reference position along image rows"),
+        "z": variable(("z",), np.arange(layers + 1) / layers, "1", "height over unloaded thickness, 0 at the window"),
         "component": (("component",), np.array(["x", "y", "z"]), {"long_name": "component of a vector"}),
         "lateral": (("lateral",), np.array(["x", "y"]), {"long_name": "component of an in-plane vector"}),
-        "x_current": _variable(NODES, current[0], "mm", "current position of interface nodes along image columns"),
-        "y_current": _variable(NODES, current[1], "mm", "current position of interface nodes along image rows"),
-        "x_element": _variable(("x_element",), 0.5 * (x[1:] + x[:-1]), "mm", "reference element centres along x"),
-        "y_element": _variable(("y_element",), 0.5 * (y[1:] + y[:-1]), "mm", "reference element centres along y"),
-        "x_image": _variable(("x_image",), grid.x, "mm", "position of image columns"),
-        "y_image": _variable(("y_image",), grid.y, "mm", "position of image rows"),
+        "x_current": variable(NODES, current[0], "mm", "current position of interface nodes along image columns"),
+        "y_current": variable(NODES, current[1], "mm", "current position of interface nodes along image rows"),
+        "x_element": variable(("x_element",), 0.5 * (x[1:] + x[:-1]), "mm", "reference element centres along x"),
+        "y_element": variable(("y_element",), 0.5 * (y[1:] + y[:-1]), "mm", "reference element centres along y"),
+        "x_image": variable(("x_image",), grid.x, "mm", "position of image columns"),
+        "y_image": variable(("y_image",), grid.y, "mm", "position of image rows"),
     }
 
 
-def _volume(solution: Solution) -> dict[str, Variable]:
+def _volume(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
     return {
-        "displacement": _variable(("component", "z", *NODES), solution.displacement, "mm", "displacement"),
-        "unloaded_thickness": _variable(NODES, solution.positions[2, -1], "mm", "unloaded thickness L0"),
-        "stress_zz": _variable(
+        "displacement": variable(("component", "z", *NODES), solution.displacement, "mm", "displacement"),
+        "unloaded_thickness": variable(NODES, solution.positions[2, -1], "mm", "unloaded thickness L0"),
+        "stress_zz": variable(
             ("y_element", "x_element"),
             solution.stress_zz,
             "MPa",
@@ -193,30 +201,20 @@ def _volume(solution: Solution) -> dict[str, Variable]:
     }
 
 
-def _interior(solution: Solution) -> dict[str, Variable]:
-    fields = layer_fields(solution)
-    tensor = ("component", "direction", "z", *NODES)
-    return {
-        "stress": _variable(tensor, fields.at_nodes(fields.stress), "MPa", "Cauchy stress, tension positive"),
-        "green_strain": _variable(tensor, fields.at_nodes(fields.green_strain), "1", "Green–Lagrange strain"),
-        "energy_density": _variable(
-            ("z", *NODES), fields.at_nodes(fields.energy_density), "MPa", "strain energy per reference volume"
-        ),
-    }
-
-
-def _face(prefix: str, where: str, face: FaceResult, failed: bool) -> dict[str, Variable]:
+def _face(
+    prefix: str, where: str, face: FaceResult, failed: bool, body: str = "layer", nodes: tuple[str, ...] = NODES
+) -> dict[str, Variable]:
     status = np.full(face.status.shape, NOT_CONVERGED) if failed else np.asarray(face.status)
     return {
-        f"{prefix}pressure": _variable(
-            NODES, face.pressure, "MPa", f"contact pressure {where} on the current area, compression positive"
+        f"{prefix}pressure": variable(
+            nodes, face.pressure, "MPa", f"contact pressure {where} on the current area, compression positive"
         ),
-        f"{prefix}traction": _variable(
-            ("component", *NODES), face.traction, "MPa", f"force on the layer {where} per reference area"
+        f"{prefix}traction": variable(
+            ("component", *nodes), face.traction, "MPa", f"force on the {body} {where} per reference area"
         ),
-        f"{prefix}slip": _variable(("lateral", *NODES), face.slip, "mm", f"tangential slip {where}"),
-        f"{prefix}contact_status": _variable(
-            NODES,
+        f"{prefix}slip": variable(("lateral", *nodes), face.slip, "mm", f"tangential slip {where}"),
+        f"{prefix}contact_status": variable(
+            nodes,
             status.astype(np.int8),
             "1",
             f"contact status {where}",
@@ -226,52 +224,41 @@ def _face(prefix: str, where: str, face: FaceResult, failed: bool) -> dict[str, 
     }
 
 
-def _image(solution: Solution) -> dict[str, Variable]:
+def _image(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
     grid = solution.thickness
-    y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")
     outside = np.asarray(grid.mask)
-    pressure = _pressure_image(solution, x, y)
     images = {
-        "thickness": _variable(
+        "thickness": variable(
             IMAGE, np.where(outside, np.nan, grid.values), "mm", "computed thickness of the loaded layer"
         ),
-        "pressure_image": _variable(
-            IMAGE, np.where(outside, np.nan, pressure), "MPa", "contact pressure at the sample under each pixel"
+        "pressure_image": variable(
+            IMAGE, pressure_image(solution), "MPa", "contact pressure at the sample under each pixel"
         ),
     }
     if isinstance(solution.load, Imprint):
         given = solution.load.thickness
-        images["imposed_thickness"] = _variable(IMAGE, given.values, "mm", "thickness map that was pressed in")
-        images["missing"] = _variable(IMAGE, given.mask, "1", "pixels of that map that hold no measured data")
+        images["imposed_thickness"] = variable(IMAGE, given.values, "mm", "thickness map that was pressed in")
+        images["missing"] = variable(IMAGE, given.mask, "1", "pixels of that map that hold no measured data")
     return images
-
-
-def _pressure_image(
-    solution: Solution, x: Float[np.ndarray, "my mx"], y: Float[np.ndarray, "my mx"]
-) -> Float[np.ndarray, "my mx"]:
-    lateral = np.asarray(solution.displacement[:2, -1])
-    if not np.isfinite(lateral).all():
-        return np.full(x.shape, np.nan)
-    return under_pixels(np.asarray(solution.pressure), np.asarray(solution.positions[:2, -1]), lateral, x, y)
 
 
 def _fit(fit: TractionFit) -> dict[str, Variable]:
     return {
-        "pressure_std": _variable(NODES, fit.pressure_std, "MPa", "posterior standard deviation of the pressure"),
-        "normal_std": _variable(
+        "pressure_std": variable(NODES, fit.pressure_std, "MPa", "posterior standard deviation of the pressure"),
+        "normal_std": variable(
             NODES, fit.normal_std, "MPa", "posterior standard deviation of the normal traction per reference area"
         ),
-        "residual": _variable(
+        "residual": variable(
             NODES, fit.residual, "mm", "interface minus measured surface at the places of the unloaded nodes"
         ),
-        "chi2": _variable((), fit.chi2, "1", "sum of squared misfits over their noise"),
-        "effective_dof": _variable((), fit.effective_dof, "1", "degrees of freedom that the map determines"),
-        "observed": _variable((), fit.observed, "1", "independent numbers of the map on the mesh's splines"),
-        "reduced_chi2": _variable((), fit.reduced_chi2, "1", "chi2 over the degrees of freedom left"),
-        "resolution_points": _variable(
+        "chi2": variable((), fit.chi2, "1", "sum of squared misfits over their noise"),
+        "effective_dof": variable((), fit.effective_dof, "1", "degrees of freedom that the map determines"),
+        "observed": variable((), fit.observed, "1", "independent numbers of the map on the mesh's splines"),
+        "reduced_chi2": variable((), fit.reduced_chi2, "1", "chi2 over the degrees of freedom left"),
+        "resolution_points": variable(
             ("resolution_point", "lateral"), fit.resolution_points, "mm", "where the resolution was looked at"
         ),
-        "resolution_width": _variable(
+        "resolution_width": variable(
             ("resolution_point",), fit.resolution_width, "mm", "full width at half maximum of the resolution kernel"
         ),
         **_numbers(fit),
@@ -316,26 +303,29 @@ def _stats(stats: dict[str, Any], labels: dict[str, tuple[str, str]]) -> dict[st
     return labelled
 
 
-def _record(solution: Solution) -> dict[str, Any]:
+def _record(solution: Solution | ExperimentSolution) -> dict[str, Any]:
     """Collect what made this result; only types that netCDF stores."""
-    palpation, load = solution.palpation, solution.load
+    load = solution.load
+    problem = solution.palpation if isinstance(solution, Solution) else solution.experiment
     record = {
         "title": "Stress on the sample from the thickness of a soft layer",
         "conventions": "mm, N, MPa; tension positive, contact pressure positive in compression; x along image "
         "columns, y along image rows, z from the window to the sample",
         "status": status_name(solution),
         "status_message": status_message(solution),
-        "element": palpation.element,
-        "elements": np.array(palpation.elements),
-        "extent": np.asarray(palpation.extent),
-        "sides": json.dumps(dict(zip(("x0", "x1", "y0", "y1"), palpation.sides, strict=True))),
-        "layer": json.dumps(describe(palpation.layer)),
-        "window": json.dumps(describe(palpation.window)),
-        "sample": json.dumps(describe(palpation.sample)),
+        "extent": np.asarray(problem.extent),
+        "sides": json.dumps(dict(zip(("x0", "x1", "y0", "y1"), problem.sides, strict=True))),
+        "layer": json.dumps(describe(problem.layer)),
+        "window": json.dumps(describe(problem.window)),
+        "sample": json.dumps(describe(problem.sample)),
         "load": json.dumps(describe(load)),
-        "inputs_sha256": inputs_hash(palpation=palpation, load=load),
         **versions(),
     }
+    if isinstance(solution, Solution):
+        record |= {"element": solution.palpation.element, "elements": np.array(solution.palpation.elements)}
+        record["inputs_sha256"] = inputs_hash(palpation=solution.palpation, load=load)
+    else:
+        record |= sample_record(solution)
     if isinstance(load, Imprint):
         record["thickness_steps"] = steps_as_json(load.thickness)
     return record

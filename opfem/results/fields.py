@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.interface_point import NodalField, locate
+from ..solvers import ExperimentSolution, Solution
 from ..solvers.compiling import QuickJit
 
 
@@ -33,6 +34,18 @@ def under_pixels(
     return np.asarray(
         _under_pixels(*(jnp.asarray(v) for v in (field, positions[:, -1, -1], lateral, np.stack([x, y]))))
     )
+
+
+def pressure_image(solution: Solution | ExperimentSolution) -> Float[Array, "py px"]:
+    """Read the contact pressure [MPa] on the pixels of the solution's thickness map; NaN where no interface lies.
+
+    Args:
+        solution: What `solve` returned; works under jit, vmap and grad.
+    """
+    grid, surface = solution.thickness, solution.positions[:2, -1]
+    place = jnp.stack(jnp.meshgrid(grid.x, grid.y))
+    pressure = _under_pixels(solution.pressure, surface[:, -1, -1], solution.displacement[:2, -1], place)
+    return jnp.where(grid.mask, jnp.nan, pressure)
 
 
 @QuickJit

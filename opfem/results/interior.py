@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..mechanics.internal import layer_body
+from ..mechanics.internal import LayerBody, layer_body
 from ..mechanics.kinematics import CellKind, LayerCells, contract
 from ..model.deformation import identity_like, product, transpose
-from ..solvers import Solution
+from ..solvers import ExperimentSolution, Solution
 
 
 class LayerFields(eqx.Module):
@@ -81,7 +81,7 @@ def _extrapolation(kind: CellKind, points: int) -> np.ndarray:
     return terms(kind.nodes / kind.span) @ np.linalg.pinv(terms(own))
 
 
-def layer_fields(solution: Solution) -> LayerFields:
+def layer_fields(solution: Solution | ExperimentSolution) -> LayerFields:
     """Compute stress, strain and energy inside the layer of a solution; NaN where the solve failed.
 
     In "mean_dilatation" and "hybrid" elements the mean stress is the element's.
@@ -89,7 +89,25 @@ def layer_fields(solution: Solution) -> LayerFields:
     Args:
         solution: What `solve` returned; works under jit, vmap and grad.
     """
+    if isinstance(solution, ExperimentSolution):
+        experiment = solution.experiment
+        body = layer_body(experiment.layer_mesh(), experiment.layer.material, experiment.element[0])
+        return _fields(body, solution.layer.displacement, solution.layer.mean_stress)
     palpation = solution.palpation
     body = layer_body(palpation.mesh(), palpation.layer.material, palpation.element)
-    mean_stress = solution.last_converged.state.mean_stress
-    return LayerFields(*body.fields(solution.displacement, mean_stress), body.field_volume(), body.cells)
+    return _fields(body, solution.displacement, solution.last_converged.state.mean_stress)
+
+
+def sample_fields(solution: ExperimentSolution) -> LayerFields:
+    """Compute stress, strain and energy inside the sample of an experiment, as `layer_fields` does in the layer.
+
+    Args:
+        solution: What `solve` returned; works under jit, vmap and grad.
+    """
+    experiment = solution.experiment
+    body = layer_body(experiment.sample_mesh(), experiment.sample_material(), experiment.element[1])
+    return _fields(body, solution.sample.displacement, solution.sample.mean_stress)
+
+
+def _fields(body: LayerBody, displacement: Array, mean_stress: Array | None) -> LayerFields:
+    return LayerFields(*body.fields(displacement, mean_stress), body.field_volume(), body.cells)

@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from ..inverse.observation import interface_heights
 from ..measurement import ThicknessMap
-from ..solvers import Solution
+from ..solvers import ExperimentSolution, Solution
 
 _ITERATIONS = 30  # of the inverse map; each gains a digit at strains of 30 %
 _CLOSE = 1e-9  # mm
@@ -35,7 +35,7 @@ class OctScene(eqx.Module):
     increment: Callable[[Any, Any, Any], tuple[np.ndarray, np.ndarray, np.ndarray]] | None = eqx.field(static=True)
 
 
-def oct_scene(solution: Solution, before: Solution | None = None) -> OctScene:
+def oct_scene(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution | None = None) -> OctScene:
     """Make a scene of a solution, or of the increment between two of them.
 
     Args:

@@ -51,6 +51,8 @@ def describe(part: Any) -> Any:
         if values.size <= _WRITTEN_OUT:
             return values.tolist()
         return {"shape": list(values.shape), "min": values.min().item(), "max": values.max().item()}
+    if isinstance(part, tuple | list):
+        return [describe(item) for item in part]
     return part
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..solvers import Solution
+from ..solvers import ExperimentSolution, Solution
 from .dataset import status_message, status_name
 from .fields import node_areas
 
@@ -17,7 +17,7 @@ _KPA = 1e3
 _UM = 1e3
 
 
-def summary(solution: Solution) -> dict[str, Any]:
+def summary(solution: Solution | ExperimentSolution) -> dict[str, Any]:
     """Summarise a solution in types that JSON knows; every key states its unit.
 
     Means and fractions are weighted by area: pressure by the current area, contact by the reference area.
@@ -27,9 +27,11 @@ def summary(solution: Solution) -> dict[str, Any]:
         solution: One solution, outside jit.
     """
     stats = {name: np.asarray(value) for name, value in solution.stats.items()}
-    forces = {f"{name}_N": stats[name].tolist() for name in ("force_sample", "force_window", "force_hold")}
+    outer = ("force_window", "force_hold")
+    outer = ("force_plate", *outer) if isinstance(solution, ExperimentSolution) else ("force_sample", *outer)
+    forces = {f"{name}_N": stats[name].tolist() for name in dict.fromkeys(("force_sample", *outer))}
     pressing = np.linalg.norm(stats["force_sample"])
-    unbalanced = np.linalg.norm(sum(stats[name] for name in ("force_sample", "force_window", "force_hold")))
+    unbalanced = np.linalg.norm(sum(stats[name] for name in outer))
     numbers = {
         "status": status_name(solution),
         "status_message": status_message(solution),
@@ -82,7 +84,7 @@ def _effort(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [("time increments", increments, ""), ("kinetic energy, energy missing", shares, "%")]
 
 
-def _pressures(solution: Solution) -> dict[str, float]:
+def _pressures(solution: Solution | ExperimentSolution) -> dict[str, float]:
     pressure = _KPA * np.asarray(solution.pressure)
     current = np.asarray(solution.positions[:, -1]) + np.asarray(solution.displacement[:, -1])
     area = node_areas(*current)
@@ -93,7 +95,7 @@ def _pressures(solution: Solution) -> dict[str, float]:
     }
 
 
-def _contact(solution: Solution) -> dict[str, float]:
+def _contact(solution: Solution | ExperimentSolution) -> dict[str, float]:
     area = node_areas(*np.asarray(solution.positions[:, -1]))
     failed = not np.isfinite(np.asarray(solution.pressure)).all()
     status = np.asarray(solution.contact_status)

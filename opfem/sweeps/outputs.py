@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ..inverse import FitStatus, TractionFit
-from ..results.dataset import FIT_STATS, IMAGE, NODES, STATS
-from ..solvers import CONVERGED, RESULTS, Solution
+from ..results.dataset import EXPERIMENT_STATS, FIT_STATS, IMAGE, NODES, STATS
+from ..results.fields import pressure_image
+from ..solvers import CONVERGED, RESULTS, ExperimentSolution, Solution
 from .design import RESERVED, known_name
 
+_Solved = Solution | ExperimentSolution
 Keep = Sequence[str] | Callable[[Any], dict[str, Any]] | None
 
 STATUS = " ended"
@@ -30,6 +32,7 @@ _ELEMENTS = ("y_element", "x_element")
 FIELDS: dict[str, tuple[tuple[str, ...], str, str, Callable[[Any], Any]]] = {
     "max_pressure": ((), "MPa", "largest contact pressure at the sample", lambda s: jnp.max(s.pressure)),
     "pressure": (NODES, "MPa", "contact pressure at the sample on the current area", lambda s: s.pressure),
+    "pressure_image": (IMAGE, "MPa", "contact pressure at the sample under each pixel", pressure_image),
     "traction": (("component", *NODES), "MPa", "force on the layer per reference area", lambda s: s.traction),
     "slip": (("lateral", *NODES), "mm", "tangential slip at the sample", lambda s: s.slip),
     "contact_status": (NODES, "1", "contact status: 0 open, 1 stick, 2 slip", lambda s: s.contact_status),
@@ -124,7 +127,7 @@ class Outputs:
         return values, labels
 
     def _named(self, name: str, part: Any):
-        if isinstance(part, Solution | TractionFit):
+        if isinstance(part, _Solved | TractionFit):
             yield from self._kept(part)
         elif isinstance(part, Sensitivities):
             yield from self._named(name, part.value)
@@ -144,9 +147,10 @@ class Outputs:
                 f"these, got {type(part).__name__} for {name!r}."
             )
 
-    def _kept(self, part: Solution | TractionFit):
+    def _kept(self, part: _Solved | TractionFit):
         solution = _solution(part)
         own = _FIT_FIELDS if isinstance(part, TractionFit) else {}
+        known = STATS | FIT_STATS | (EXPERIMENT_STATS if isinstance(part, ExperimentSolution) else {})
         stats = dict.fromkeys(solution.stats, solution.stats)
         if isinstance(part, TractionFit):
             stats |= dict.fromkeys(part.stats, part.stats)
@@ -156,7 +160,7 @@ class Outputs:
             _known("sweep.keep", name, (*FIELDS, *own, *stats))
             if name in stats:
                 value = jnp.asarray(stats[name][name])
-                unit, about = (STATS | FIT_STATS).get(name, (None, name.replace("_", " ")))
+                unit, about = known.get(name, (None, name.replace("_", " ")))
                 label = Label(("component",) if value.shape == (3,) else None, unit, about)
             else:
                 its, unit, about, of = (own | FIELDS)[name]
@@ -167,11 +171,11 @@ class Outputs:
         yield STATUS, _end_codes(part), Label()
 
 
-def _solution(part: Solution | TractionFit) -> Solution:
+def _solution(part: _Solved | TractionFit) -> _Solved:
     return part.solution if isinstance(part, TractionFit) else part
 
 
-def _grid(solution: Solution):
+def _grid(solution: _Solved):
     """Yield the positions along each dimension; they are coordinates unless they are swept."""
     X, image = solution.positions[:2, -1], solution.thickness
     x, y = X[0, 0], X[1, :, 0]
@@ -190,7 +194,7 @@ def _known(what: str, name: str, known: Any) -> None:
         raise OutputError(str(cause)) from None
 
 
-def _end_codes(part: Solution | TractionFit) -> Array:
+def _end_codes(part: _Solved | TractionFit) -> Array:
     """Write down how a solve, and a fit, ended as places in `_NAMES`; -1: there was no fit."""
     ends = {"solve": _solution(part).result} | ({"fit": part.result} if isinstance(part, TractionFit) else {})
     codes = [

@@ -75,3 +75,35 @@ def test_a_series_needs_one_rising_time_for_each_state(tmp_path, solution, state
     with pytest.raises(ValueError, match="one rising time for each"):
         op.write_pvd([op.to_xarray(solution)] * states, tmp_path / "run.pvd", times)
     assert os.listdir(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def both(truth, tmp_path_factory):
+    path = tmp_path_factory.mktemp("vtu") / "truth.vtu"
+    op.write_vtu(op.to_xarray(truth, interior=True), path)
+    return pyvista.read(path)
+
+
+def test_bodies_lie_where_they_have_moved(both, truth):
+    assert both["body"].tolist() == 72 * [0] + 100 * [1]
+    for points, body in ((both.points[:147], truth.layer), (both.points[147:], truth.sample)):
+        current = np.asarray(body.positions + body.displacement).reshape(3, -1).T
+        np.testing.assert_allclose(points, current, rtol=tol.ROUNDOFF, atol=tol.ROUNDOFF)
+    volumes = both.compute_cell_sizes(length=False, area=False)["Volume"]
+    assert volumes.min() > 0
+
+
+def test_each_body_has_its_own_arrays(both, truth):
+    layer, sample = both.extract_points(np.arange(147)), both["displacement_mm"][147:]
+    assert layer.n_points == 147
+    np.testing.assert_array_equal(sample, np.asarray(truth.sample.displacement).reshape(3, -1).T)
+    plate = np.isfinite(both["plate_pressure_MPa"])
+    assert np.flatnonzero(plate).tolist() == list(range(147 + 144, 147 + 180))
+    np.testing.assert_array_equal(both["plate_pressure_MPa"][plate].reshape(6, 6), truth.plate.pressure)
+    assert (both["contact_status"][147:] == -1).all()
+    assert (both["plate_contact_status"][:147] == -1).all()
+    stress = both["element_stress_MPa"]
+    np.testing.assert_array_equal(stress[72:].T.reshape(3, 3, 4, 5, 5), truth.sample.stress)
+    assert np.isnan(both["shear_modulus_MPa"][:72]).all()
+    assert set(np.unique(both["shear_modulus_MPa"][72:])) == {6e-3, 4e-2}
+    assert np.isfinite(both["stress_MPa"]).all()

@@ -149,3 +149,11 @@ def test_arrays_for_another_number_of_elements_are_refused(sample):
 
 def test_numbers_of_a_law_are_its_arguments():
     assert list(numbers_of(op.MooneyRivlin(2e-3, 1e-3, 0.2))) == ["c10", "c01", "bulk"]
+
+
+def test_an_incompressible_inclusion_in_a_compressible_sample():
+    law = op.Sample(2.0, SOFT).with_inclusion(BALL, op.NeoHooke(2e-2, np.inf)).material_at(*grid())
+    inside = np.asarray(BALL.contains(*grid()))
+    np.testing.assert_array_equal(law.bulk, np.where(inside, np.inf, 0.12))
+    with pytest.raises(ValueError, match=r"NeoHooke\.bulk \[MPa\] must be positive, .*got values from -1 to 0\.1"):
+        op.NeoHooke(1e-3, np.array([[[-1.0, 0.1, np.inf]]]))

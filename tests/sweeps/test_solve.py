@@ -10,7 +10,8 @@ from tests.experiments import MATERIAL, published_palpation
 from tests.tolerances import FINITE_DIFFERENCE, SOLVER
 
 C10, FRICTION = (-1e-3, 2e-3, 4e-3), (0.0, 0.2)  # a negative modulus cannot be solved
-KEEP = ("max_pressure", "pressure", "slip", "stress_zz", "contact_status", "thickness", "force_sample", "newton_steps")
+KEEP = ("max_pressure", "pressure", "pressure_image", "slip", "stress_zz", "contact_status", "thickness")
+KEEP += ("force_sample", "newton_steps")
 
 
 def palpation(c10, friction):
@@ -31,7 +32,7 @@ def test_each_point_is_what_one_solve_gives(data, loaded):
             alone = op.to_xarray(op.solve(palpation(c10, friction), op.Imprint(loaded)))
             point = data.sel(c10=c10, friction=friction)
             assert point.status.item() == alone.attrs["status"]
-            for name in ("pressure", "slip", "stress_zz", "thickness", "force_sample"):
+            for name in ("pressure", "pressure_image", "slip", "stress_zz", "thickness", "force_sample"):
                 scale = float(np.abs(alone[name]).max())
                 assert point[name].dims == alone[name].dims
                 np.testing.assert_allclose(point[name], alone[name], rtol=0, atol=SOLVER * scale, err_msg=name)
@@ -48,6 +49,20 @@ def test_what_cannot_be_solved_says_why(data):
     assert np.isnan(impossible.pressure).all()
     assert np.isnan(impossible.max_pressure).all()
     assert all(impossible.message.values)
+
+
+def test_solutions_of_experiments_are_kept_as_those_of_palpations(truth):
+    def scaled(factor):
+        return eqx.tree_at(lambda s: s.interface.pressure, truth, factor * truth.interface.pressure)
+
+    keep = ("pressure", "pressure_image", "thickness", "force_plate", "strain_energy")
+    data = op.sweep(scaled, {"factor": [1.0, 2.0]}, keep=keep, execution=op.Batch(mode="call"))
+    alone = op.to_xarray(truth)
+    for name in keep[1:]:
+        np.testing.assert_allclose(data[name].sel(factor=1.0), alone[name], rtol=1e-12)
+        assert data[name].attrs["long_name"] == alone[name].attrs["long_name"]
+    np.testing.assert_array_equal(data.pressure.sel(factor=2.0), 2 * alone.pressure)
+    assert set(data.status.values) == {"successful"}
 
 
 def test_a_swept_extent_is_no_coordinate(solution):
