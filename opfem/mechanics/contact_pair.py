@@ -103,8 +103,8 @@ class ContactPair(eqx.Module):
 
     def force(self, points: PairPoints, upper: UpperNodes, history: SlipHistory, law: TangentLaw | None) -> PairForce:
         """Compute the forces on both faces [N]; of `upper`, only its shape is needed."""
-        density = self.at_points(points, history, law).traction * self.area(points)
-        weights = quadrature(self.face.rule).weights[:, None]
+        density = (self.at_points(points, history, law).traction * self.area(points)).astype(upper.dtype)
+        weights = jnp.asarray(quadrature(self.face.rule).weights[:, None], upper.dtype)
 
         def under(nodes):
             return patch(mirrored(nodes), jax.lax.stop_gradient(points.place)).at(points.place).position
@@ -224,5 +224,6 @@ def _is_near(place: Place, surface: Array) -> Array:
     return jnp.all((place > -BEYOND) & (place < _last(place, surface) + BEYOND), axis=0)
 
 
-def _last(place: Place, surface: Array) -> np.ndarray:
-    return np.array(surface.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 3.0
+def _last(place: Place, surface: Array) -> Array:
+    """Place of the last node along each axis, less the ghosts."""
+    return jnp.asarray(np.array(surface.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 3.0, place.dtype)

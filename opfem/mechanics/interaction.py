@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..model import Contact
 from .boundary import Bodies
-from .contact_body import ImposedPressure, RigidSurface
+from .contact_body import ImposedPressure, RigidPlate, RigidSurface
 from .contact_state import (
     ContactIterate,
     Corners,
@@ -53,7 +53,7 @@ class ContactFace(eqx.Module):
     """
 
     contact: Contact | PairedContact
-    surface: RigidSurface | PairedSurface
+    surface: RigidSurface | RigidPlate | PairedSurface
     offset: Array
     imposed: "ImposedPressure | None"
     element_size: Array

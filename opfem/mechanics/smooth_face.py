@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 # Coefficients of 1, t, t², t³ in the weight of each of the four nodes around a cell, and of its derivative.
 _WEIGHTS = np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]) / 2
-_SLOPES = np.pad(_WEIGHTS[:, 1:] * np.arange(1, 4), [(0, 0), (0, 1)])
+_SLOPES = np.pad(_WEIGHTS[:, 1:] * np.arange(1, 4), np.array([(0, 0), (0, 1)]))
 # How far beyond its rim the surface is continued, in cells: more than half of what a point of a face stands for.
 BEYOND = 0.5
 
@@ -92,7 +92,7 @@ def continued(nodes: Float[Array, "3 my mx"], rims: tuple[bool, bool, bool, bool
 
 def mirrored(nodes: Float[Array, "3 my mx"]) -> Float[Array, "3 wy wx"]:
     """Continue a face by its mirror image: forces so distributed are, of a uniform pressure, those of its elements."""
-    return jnp.pad(nodes, [(0, 0), (1, 1), (1, 1)], mode="reflect")
+    return jnp.pad(nodes, ((0, 0), (1, 1), (1, 1)), mode="reflect")
 
 
 def _weights(t: Float[Array, "2 *points"], basis: np.ndarray) -> Float[Array, "2 4 *points"]:

@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from ..inverse.observation import interface_heights
 from ..measurement import ThicknessMap
+from ..model import Palpation
 from ..solvers import ExperimentSolution, Solution
 
 _ITERATIONS = 30  # of the inverse map; each gains a digit at strains of 30 %
@@ -65,16 +66,17 @@ def oct_scene(solution: Solution | ExperimentSolution, before: Solution | Experi
     return OctScene(surface, increment)
 
 
-def _surface(solution: Solution) -> ThicknessMap:
+def _surface(solution: Solution | ExperimentSolution) -> ThicknessMap:
     """Sample the cubic splines through the interface's nodes on a fine grid."""
-    mesh = solution.palpation.mesh()
+    stated = solution.palpation if isinstance(solution, Solution) else solution.experiment
+    mesh = stated.mesh() if isinstance(stated, Palpation) else stated.layer_mesh()
     heights = np.asarray(interface_heights(mesh, solution.displacement[:, -1]))
     rows, columns = heights.shape
     spline = RectBivariateSpline(
         np.arange(rows), np.arange(columns), heights, kx=min(3, rows - 1), ky=min(3, columns - 1)
     )
     fine_rows, fine_columns = (np.linspace(0, count - 1, _FINER * (count - 1) + 1) for count in heights.shape)
-    return ThicknessMap(spline(fine_rows, fine_columns), extent=solution.palpation.extent)
+    return ThicknessMap(spline(fine_rows, fine_columns), extent=stated.extent)
 
 
 def _reference(points: np.ndarray, positions: np.ndarray, displacement: np.ndarray) -> np.ndarray:

@@ -127,7 +127,9 @@ def _contact(side: Side) -> Contact:
     return side
 
 
-def check_compatible(palpation: Palpation, load: Load, start: Load | None) -> None:
+def check_compatible(
+    palpation: Palpation | Experiment, load: Load | Compression, start: Load | Compression | None
+) -> None:
     """Raise ValueError where load and sample contradict each other, or map and layer; warn where these are in doubt."""
     if isinstance(palpation, Experiment) or isinstance(load, Compression):
         _check_experiment(palpation, load, start)

@@ -67,14 +67,15 @@ def discretise_experiment(
     face = _face(experiment.interface, RigidSurface(None, None), True, lower, soft, "nodes" if exact else rule)
     assert face is not None
     between = 1.0 / (1.0 / face.stiffness + 1.0 / _stiffness(upper, material))
+    x0, x1, y0, y1 = (side == "free" for side in experiment.sides)
     pair = ContactPair(
         face=dataclasses.replace(face, stiffness=between),
         spacing=jnp.stack(upper.spacing),
         lower_spacing=jnp.stack(lower.spacing),
         soft=SOFT * soft.shear,
-        rims=tuple(side == "free" for side in experiment.sides),
+        rims=(x0, x1, y0, y1),
     )
-    return Stack(layer, sample, pair, jnp.zeros((), layer.positions.dtype))
+    return Stack(lower=layer, upper=sample, pair=pair, viscosity=jnp.zeros((), layer.positions.dtype))
 
 
 def _body(

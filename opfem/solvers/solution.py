@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._checks import concrete
 from ..measurement import ThicknessMap
@@ -93,12 +93,12 @@ class LastConverged(eqx.Module):
     """The last converged state of a solve.
 
     Attributes:
-        displacement: `(3, nz+1, ny+1, nx+1)` [mm].
+        displacement: `(3, nz+1, ny+1, nx+1)` [mm]; of an experiment, the layer's and the sample's.
         load_fraction: How much of the load it carries [-].
         state: The same with its friction history, for `solve(..., start=)`.
     """
 
-    displacement: Float[Array, "3 mz my mx"]
+    displacement: PyTree[Float[Array, "3 _ _ _"]]
     load_fraction: Float[Array, ""]
     state: State | Motion
 

@@ -1,6 +1,6 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
-from typing import Any, overload
+from typing import Any, cast, overload
 
 import equinox as eqx
 import jax
@@ -93,13 +93,14 @@ def solve(
         ValueError: If load and palpation contradict each other, or numbers are float32.
         ConvergenceError: If the solve fails and `throw` is True.
     """
-    if isinstance(solver, Explicit):
-        check_compatible(palpation, load, None if start is None else start.load)
-        solution = judged(solve_explicit(palpation, load, solver, start, progress))
-        return _raise_on_failure(solution, is_traced(solution)) if throw else solution
-    solver = solver.as_leaves()
     load_start = None if start is None else start.load
     check_compatible(palpation, load, load_start)
+    if isinstance(solver, Explicit):
+        if not isinstance(palpation, Palpation):
+            raise ValueError("Explicit solves a Palpation, got an Experiment. Take Newton().")
+        solution = judged(solve_explicit(palpation, cast(Any, load), solver, cast(Any, start), progress))
+        return _raise_on_failure(solution, is_traced(solution)) if throw else solution
+    solver = solver.as_leaves()
     first = None if start is None else start.last_converged.state
     if first is not None and not isinstance(first, State):
         raise ValueError("Newton continues what Newton solved, but start comes from Explicit. Use one solver for both.")
@@ -121,8 +122,10 @@ def solve(
 @QuickJit
 def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[AbstractProblem, Stepping]:
     """Discretise a palpation or an experiment under a load, and begin at a state or at rest."""
-    build = discretise_experiment if isinstance(palpation, Experiment) else discretise
-    problem = build(palpation, load, load_start, solver.face_rule)
+    if isinstance(palpation, Experiment):
+        problem = discretise_experiment(palpation, load, load_start, solver.face_rule)
+    else:
+        problem = discretise(palpation, load, load_start, solver.face_rule)
     initial = problem.initial_state()
     if state is None:
         stepping = begin(initial, solver, traced)
@@ -186,7 +189,7 @@ def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> t
 
 
 @QuickJit
-def _approach(problem: AbstractProblem, s: Stepping, load: Load) -> Array:
+def _approach(problem: Any, s: Stepping, load: Load) -> Array:
     return recover(problem, s.before, s.state, load).stats["approach"]
 
 

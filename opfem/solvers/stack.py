@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.boundary import Touching, put, take, to_touching
 from ..mechanics.contact_pair import ContactPair, PairForce
@@ -28,6 +28,8 @@ _TOUCH = 1e-3
 # upper body's soft springs: on 12×12×(2+6) elements with the exponential law and friction 0.05, one, three with
 # friction's coupling left out, and three with it take 96, 77 and 24 iterations a Newton step.
 _LOWER_CYCLES = 3
+
+UpperNodal = Float[Array, "3 uz uy ux"]
 
 
 class StackForces(NamedTuple):
@@ -304,7 +306,7 @@ class StackTangent(NamedTuple):
 
         return jax.lax.fori_loop(0, _LOWER_CYCLES, improve, jax.tree.map(jnp.zeros_like, r))
 
-    def _between(self, lower: Nodal, upper: Nodal) -> tuple[Nodal, Nodal]:
+    def _between(self, lower: Nodal, upper: UpperNodal) -> tuple[Nodal, UpperNodal]:
         """Compute how forces of contact between the bodies change with their motion."""
         lower, upper = (_inside(v, body) for v, body in zip((lower, upper), self.bodies, strict=True))
         force = self.between(take(lower, "sample", with_sides=False), upper[:, 0])

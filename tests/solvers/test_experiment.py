@@ -1,0 +1,145 @@
+"""A layer and a deformable sample pressed together: closed forms, balance, derivatives, and published references."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import opfem as op
+
+SOFT = op.MooneyRivlin(c10=0.00223, c01=0.000703, bulk=0.11732)  # MPa, of the references
+PENALTY = 2.0  # MPa/mm
+L0, SAMPLE = 0.5, 2.0  # mm
+
+
+def scaled(ratio):
+    return op.MooneyRivlin(c10=ratio * SOFT.c10, c01=ratio * SOFT.c01, bulk=ratio * SOFT.bulk)
+
+
+def stack(ratio=1.0, sides="roller", elements=(3, 3, (2, 3)), friction=0.0, layer=SOFT):
+    return op.Experiment(
+        op.Layer(L0, layer),
+        op.Sample(SAMPLE, scaled(ratio)),
+        extent=(1.0, 1.0),
+        elements=elements,
+        window=op.Roller(),
+        interface=op.Contact(op.LinearOverclosure(PENALTY), friction=friction, stick_slope=0.05),
+        plate=op.Roller(),
+        sides=sides,
+    )
+
+
+def confined_stress(stretch, material):
+    """Nominal stress [MPa] of a block that cannot widen, from its energy."""
+    F = lambda s: jnp.diag(jnp.array([1.0, 1.0, s])).reshape(3, 3, 1)  # noqa: E731
+    return float(jax.grad(lambda s: material.energy(F(s))[0])(stretch))
+
+
+@pytest.fixture(scope="module")
+def confined():
+    return {ratio: op.solve(stack(ratio), op.Compression(0.3 * (L0 + SAMPLE))) for ratio in (0.1, 1.0, 10.0, 100.0)}
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
+def test_confined_stack_is_two_blocks_and_a_spring_in_series(confined, ratio):
+    solution = confined[ratio]
+    top, bottom = solution.layer.displacement[2, -1], solution.sample.displacement[2, 0]
+    in_layer = confined_stress(1.0 + top[1, 1] / L0, SOFT)
+    in_sample = confined_stress(1.0 - (0.75 + bottom[1, 1]) / SAMPLE, scaled(ratio))
+    in_spring = -PENALTY * (top - bottom)[1, 1]
+    force = solution.stats["force_plate"][2]  # on 1 mm²
+    np.testing.assert_allclose([in_layer, in_sample, in_spring], force, rtol=1e-4)
+    np.testing.assert_allclose(top, top[0, 0], atol=1e-8)
+
+
+def test_uniform_pressure_passes_matching_faces_unchanged():
+    solution = op.solve(stack(1.0, sides="free"), op.Compression(0.25))
+    pressure = np.asarray(solution.pressure)
+    np.testing.assert_allclose(pressure, pressure.mean(), rtol=1e-6)
+
+
+def test_action_is_reaction(confined):
+    stats = confined[10.0].stats
+    total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
+    assert np.abs(total).max() < 1e-6 * np.abs(stats["force_window"]).max()
+    np.testing.assert_allclose(stats["force_plate"][2], stats["force_sample"][2], rtol=1e-6)
+
+
+def mean_pressure(c10, ratio, approach):
+    layer = op.MooneyRivlin(c10=c10, c01=7.03e-4, bulk=0.11732)
+    experiment = stack(ratio, "free", (3, 2, (1, 2)), friction=0.1, layer=layer)
+    solution = op.solve(experiment, op.Compression(approach), op.Newton(rtol=1e-10, increments=2), throw=False)
+    return jnp.mean(solution.pressure)
+
+
+def test_derivatives_agree_forward_reverse_and_with_differences():
+    at = (jnp.asarray(2.2e-3), jnp.asarray(2.0), jnp.asarray(0.2))
+    reverse = jax.jit(jax.grad(mean_pressure, argnums=(0, 1, 2)), compiler_options=op.compiler_options())(*at)
+    value = jax.jit(mean_pressure, compiler_options=op.compiler_options())
+    for k, slope in enumerate(reverse):
+        step = 1e-4 * at[k]
+        ends = [value(*(v + sign * step * (i == k) for i, v in enumerate(at))) for sign in (1.0, -1.0)]
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2.0 * step), rtol=1e-4)
+
+
+def law(numbers):
+    return op.MooneyRivlin(c10=numbers["C10"], c01=numbers["C01"], bulk=numbers["bulk"])
+
+
+def side(stated):
+    if isinstance(stated, str):
+        return {"roller": op.Roller(), "bonded": op.Bonded()}[stated]
+    return op.Contact(op.LinearOverclosure(stated["k"]), stated["mu"], stick_slope=stated["lam"])
+
+
+def referenced(case):
+    """Build the experiment of a reference, on its mesh."""
+    geometry, counts = case["geometry"], case["mesh"]
+    (x0, x1), (y0, y1) = geometry["x"], geometry["y"]
+    sides = dict.fromkeys(("y0", "y1"), "roller") if case["plane_strain_slice"] else {}
+    sides |= {"x0" if x == x0 else "x1": "roller" for x in case["ux_zero_at_x"]}
+    sides |= {"y0" if y == y0 else "y1": "roller" for y in case["uy_zero_at_y"]}
+    nx, ny, nz = counts["layer"]
+    thickness = geometry.get("H_sample", SAMPLE)
+    if "cos" in geometry["surface"]:  # the crests start 0.2 µm inside the layer
+        x = np.linspace(x0, x1, nx + 1)
+        ridges = geometry["z_plate"] - L0 - 0.125 * (1.0 - np.cos(1.8 * np.pi * x)) + 2e-4
+        thickness = op.ThicknessMap(np.stack([ridges, ridges]), extent=(x1 - x0, y1 - y0))
+    sample = op.Sample(thickness, law(case["materials"][0]))
+    if "x>2.5" in case["material_of"]:
+        sample = sample.with_inclusion(op.HalfSpace((2.5, 0.0, 0.0), (1.0, 0.0, 0.0)), law(case["materials"][1]))
+    elif "x<0.5" in case["material_of"]:
+        box = op.Box(low=(-0.5, -0.5, 0.25), high=(0.5, 0.5, 1.25))
+        sample = sample.with_inclusion(box, law(case["materials"][1]))
+    return op.Experiment(
+        op.Layer(geometry["H_layer"], law(case["materials"][0])),
+        sample,
+        extent=(x1 - x0, y1 - y0),
+        elements=(nx, ny, (nz, counts["sample"][2])),
+        window=side(case["window"]),
+        interface=side(case["interface"]),
+        plate=side(case["plate"]),
+        sides=sides,
+        element="full",
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ridge_slice_C3D8_n20_roller_mu0",
+        pytest.param("col_slice_C3D8_n40_k2", marks=pytest.mark.slow),
+        pytest.param("incl_box_roller_contact_C3D8_n10", marks=pytest.mark.slow),
+        pytest.param("ridge_slice_C3D8_n20_bonded_mu0.1", marks=pytest.mark.slow),
+        pytest.param("ridge_slice_C3D8_n40_roller_mu0", marks=pytest.mark.slow),
+    ],
+)
+def test_calculix_gives_the_same_force_on_the_same_mesh(shared, name):
+    """Its C3D8 is plain full integration; its faces are flat between nodes where opfem's are smooth: 1 %."""
+    case = json.loads((shared / "reference" / "pairs" / f"{name}.json").read_text())
+    forces = case["results"]["forces_N"]
+    (expected,) = (force[2] for key, force in forces.items() if key.startswith("window_reaction"))
+    solution = op.solve(referenced(case), op.Compression(case["delta"]))
+    np.testing.assert_allclose(solution.stats["force_window"][2], expected, rtol=0.01)
