@@ -35,6 +35,14 @@ PRINTED = {
         r"l0 +first order [+-]\d\.\d\d, total \d\.\d\d",
         r"largest influence: \w+",
     ],
+    "virtual_experiment": [
+        r"truth: 0\.02\d+ N, contrast 1\.9\d, edge 0\.3\d mm",
+        r"held: error ([6-9]|1[0-2])\.\d%",
+        r"slippery: error [1-4]\.\d%",
+        r"fit: error [1-5]\.\d%",
+        r"uniaxial: error (2\d|3[0-5])\.\d%",
+        r"(8\d|9\d|100)% of places within two standard deviations",
+    ],
     "verification": [
         r"uniform compression: largest difference \d\.\de-(0[7-9]|1\d)",
         r"without friction: difference \d\.\de-(0[7-9]|1\d)",

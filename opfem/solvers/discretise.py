@@ -29,7 +29,7 @@ from ..model import (
     Traction,
     height_field,
 )
-from ..model.plausible import check_against_layer
+from ..model.plausible import check_against_layer, check_approach
 from .equilibrium import Problem
 from .supports import Supports, drift_modes
 from .tangent import VOLUME_GUARD
@@ -170,6 +170,7 @@ def _check_experiment(experiment: Any, load: Any, start: Any) -> None:
         raise ValueError(f"An Experiment takes Compression(approach) [mm], got {type(load).__name__}.")
     if start is not None and not isinstance(start, Compression):
         raise ValueError(f"start must be a solved Experiment, got a solution under {type(start).__name__}.")
+    check_approach(load.approach, experiment.plate_height)
 
 
 def _supports(palpation: Palpation, load: Load) -> Supports:
