@@ -76,8 +76,7 @@ def continued(nodes: Float[Array, "3 my mx"], rims: tuple[bool, bool, bool, bool
         rims: Whether the face ends at x0, x1, y0, y1; else there is a plane of symmetry.
     """
     for axis, ends in ((2, rims[:2]), (1, rims[2:])):
-        odd = np.zeros((3, 1, 1))
-        odd[2 - axis] = 1.0  # the coordinate across the plane
+        odd = jnp.asarray(np.arange(3).reshape(3, 1, 1) == 2 - axis, nodes.dtype)  # the coordinate across the plane
 
         def ghost(row, is_rim, axis=axis, odd=odd):
             a, b, *more = row[:3]

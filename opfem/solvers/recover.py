@@ -20,7 +20,7 @@ from ..mechanics.face import (
 )
 from ..mechanics.interaction import ContactFace
 from ..mechanics.interface_point import NodalField, locate
-from ..model import Imprint, Load, extreme_stretches
+from ..model import Compression, Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State
 from .solution import OPEN, SLIP, STICK, FaceResult
 
@@ -164,7 +164,9 @@ def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Arra
     return pressure, force / filled_vertices(tributary_area(X, cells), cells)
 
 
-def deformed_thickness(X: Float[Array, "3 my mx"], u: Float[Array, "3 my mx"], load: Load) -> ThicknessMap:
+def deformed_thickness(
+    X: Float[Array, "3 my mx"], u: Float[Array, "3 my mx"], load: Load | Compression
+) -> ThicknessMap:
     """Read the deformed interface at the load's grid points, or at the mesh's own; masked where none lies above.
 
     Args:

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from ..measurement import ThicknessMap
 from ..mechanics.boundary import take, to_touching
 from ..mechanics.face import to_corners
-from ..model import Load, extreme_stretches
+from ..model import Compression, extreme_stretches
 from .equations import State
 from .equilibrium import Problem
 from .recover import at_nodes, deformed_thickness, face_result, per_area
@@ -27,7 +27,7 @@ class ExperimentFields(eqx.Module):
     stats: dict[str, Array]
 
 
-def recover_experiment(problem: Stack, before: State, state: State, load: Load) -> ExperimentFields:
+def recover_experiment(problem: Stack, before: State, state: State, load: Compression) -> ExperimentFields:
     """Recover the fields of a state, given the one its last increment started from."""
     forces = problem.forces(state.unknowns, state.fraction, before)
     lower, upper = (body.reactions(f) for body, f in zip(problem.bodies, forces.bodies, strict=True))
