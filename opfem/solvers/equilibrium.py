@@ -26,7 +26,7 @@ from ..mechanics.internal import LayerBody
 from .equations import AbstractProblem, HoldBalance, State
 from .multigrid import build_multigrid
 from .stencil import Nodal
-from .supports import Supports
+from .supports import Supports, rigid_drift
 from .tangent import Tangent, Unknowns, couple_volume
 
 
@@ -216,16 +216,8 @@ class Problem(AbstractProblem):
         """Move the body as a whole so that its window face has none of the held rigid motions."""
         if self.drift_modes is None:
             return u
-        X = self.positions[:2] - jnp.mean(self.positions[:2], axis=(1, 2, 3), keepdims=True)
-        x, y = X
-        one, none = jnp.ones_like(x), jnp.zeros_like(x)
-        candidates = (jnp.stack([one, none]), jnp.stack([none, one]), jnp.stack([-y, x]))
-        fields = jnp.stack([field for field, drifts in zip(candidates, self.supports.drifts, strict=True) if drifts])
-        fields, modes = fields.astype(u.dtype), self.drift_modes.astype(u.dtype)
-        measured = jnp.tensordot(modes, jnp.moveaxis(fields[:, :, 0], 0, -1), 3)  # modes, fields
-        share = _solve_small(measured, jnp.tensordot(modes, u[:2, 0], 3))
-        drift = jnp.tensordot(jnp.where(held, share, 0.0), fields, 1)
-        return jnp.concatenate([u[:2] - drift, u[2:]])
+        drift = rigid_drift(self.positions, u[:2, 0], self.drift_modes, self.supports)
+        return jnp.concatenate([u[:2] - jnp.where(held, drift, 0.0), u[2:]])
 
     def limited(self, change: Nodal, step_limit: float | int | Array) -> Nodal:
         """Shorten the moves of single nodes that stand out of a step."""
@@ -393,22 +385,6 @@ class Problem(AbstractProblem):
         nothing = self.contacts.map(lambda body, _: to_touching(0.0 * self._corners(u, body), self.elements))
         applied = Bodies(*(touching or Touching(u[:, 0], None) for touching in nothing))
         return State(u, mean_stress, zero, histories, jnp.asarray(True), applied, Bodies(zero, zero))
-
-
-def _solve_small(A: Array, b: Array) -> Array:
-    """Solve for as many unknowns as there are drifts, at most three, without LAPACK: by Cramer's rule."""
-    n = b.shape[0]
-    if n == 1:
-        return b / A[0]
-
-    def determinant(A):
-        if n == 2:
-            return A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-        return jnp.dot(A[0], jnp.cross(A[1], A[2]))
-
-    whole = determinant(A)
-    columns = [jnp.concatenate([A[:, :k], b[:, None], A[:, k + 1 :]], axis=1) for k in range(n)]
-    return jnp.stack([determinant(column) / whole for column in columns])
 
 
 # Every corner's share of its element, as an element matrix.

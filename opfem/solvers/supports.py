@@ -60,3 +60,39 @@ def drift_modes(positions: Nodal, supports: Supports) -> Float[Array, "modes 2 m
                 mode = mode - jnp.sum(mode * other) * other
             modes.append(mode / jnp.sqrt(jnp.sum(mode**2)))
     return jnp.stack(modes) if modes else None
+
+
+def rigid_drift(
+    positions: Nodal, face: Float[Array, "2 my mx"], modes: Float[Array, "modes 2 my mx"], supports: Supports
+) -> Float[Array, "2 mz my mx"]:
+    """Find the rigid in-plane motion of the whole body whose window face moves in the modes as `face` does.
+
+    Args:
+        positions: Reference positions of the nodes [mm].
+        face: In-plane displacement of the window face [mm].
+        modes: What `drift_modes` gives.
+        supports: Which displacements are prescribed.
+    """
+    x, y = positions[:2] - jnp.mean(positions[:2], axis=(1, 2, 3), keepdims=True)
+    one, none = jnp.ones_like(x), jnp.zeros_like(x)
+    candidates = (jnp.stack([one, none]), jnp.stack([none, one]), jnp.stack([-y, x]))
+    motions = jnp.stack([motion for motion, drifts in zip(candidates, supports.drifts, strict=True) if drifts])
+    motions, modes = motions.astype(face.dtype), modes.astype(face.dtype)
+    measured = jnp.tensordot(modes, jnp.moveaxis(motions[:, :, 0], 0, -1), 3)  # modes, motions
+    return jnp.tensordot(_solve_small(measured, jnp.tensordot(modes, face, 3)), motions, 1)
+
+
+def _solve_small(A: Array, b: Array) -> Array:
+    """Solve for as many unknowns as there are drifts, at most three, without LAPACK: by Cramer's rule."""
+    n = b.shape[0]
+    if n == 1:
+        return b / A[0]
+
+    def determinant(A):
+        if n == 2:
+            return A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+        return jnp.dot(A[0], jnp.cross(A[1], A[2]))
+
+    whole = determinant(A)
+    columns = [jnp.concatenate([A[:, :k], b[:, None], A[:, k + 1 :]], axis=1) for k in range(n)]
+    return jnp.stack([determinant(column) / whole for column in columns])

@@ -1,4 +1,4 @@
-"""A layer and a deformable sample pressed together: closed forms, balance, derivatives, and published references."""
+"""A layer and a deformable sample pressed together: closed forms, balance, and references of CalculiX."""
 
 import json
 
@@ -39,7 +39,10 @@ def confined_stress(strain, material):
 
 @pytest.fixture(scope="module")
 def confined():
-    return {ratio: op.solve(stack(ratio), op.Compression(0.3 * (L0 + SAMPLE))) for ratio in (0.1, 1.0, 10.0, 100.0)}
+    return {
+        ratio: op.solve(stack(ratio), op.Compression(0.3 * (L0 + SAMPLE)), op.Newton(rtol=1e-10))
+        for ratio in (0.1, 1.0, 10.0, 100.0)
+    }
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
@@ -65,23 +68,6 @@ def test_action_is_reaction(confined):
     total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
     assert np.abs(total).max() < 1e-6 * np.abs(stats["force_window"]).max()
     np.testing.assert_allclose(stats["force_plate"][2], stats["force_sample"][2], rtol=1e-6)
-
-
-def mean_pressure(c10, ratio, approach):
-    layer = op.MooneyRivlin(c10=c10, c01=7.03e-4, bulk=0.11732)
-    experiment = stack(ratio, "free", (3, 2, (1, 2)), friction=0.1, layer=layer)
-    solution = op.solve(experiment, op.Compression(approach), op.Newton(rtol=1e-10, increments=2), throw=False)
-    return jnp.mean(solution.pressure)
-
-
-def test_derivatives_agree_forward_reverse_and_with_differences():
-    at = (jnp.asarray(2.2e-3), jnp.asarray(2.0), jnp.asarray(0.2))
-    reverse = jax.jit(jax.grad(mean_pressure, argnums=(0, 1, 2)), compiler_options=op.compiler_options())(*at)
-    value = jax.jit(mean_pressure, compiler_options=op.compiler_options())
-    for k, slope in enumerate(reverse):
-        step = 1e-4 * at[k]
-        ends = [value(*(v + sign * step * (i == k) for i, v in enumerate(at))) for sign in (1.0, -1.0)]
-        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2.0 * step), rtol=1e-4)
 
 
 def law(numbers):
