@@ -88,6 +88,7 @@ def solve(
         stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
         law is unstable, 0 if it was stable as far as it was stretched). Of an experiment `force_sample`
         is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
+        Derivatives of an experiment are NaN for now: their linear systems do not converge.
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.

@@ -89,7 +89,7 @@ def test_an_oct_scene_shows_the_layers_thickness(truth):
     surface, thickness = op.oct_scene(truth).surface, truth.thickness
     x, y = jnp.meshgrid(thickness.x[1:-1], thickness.y[1:-1])
     off = np.asarray(surface.sample(x, y) - thickness.values[1:-1, 1:-1])
-    # The scene runs splines through the moved nodes, the map facets: between nodes they differ by an eighth of the bend.
+    # Splines through the moved nodes and facets differ by an eighth of the bend between nodes.
     bend = max(np.abs(np.diff(thickness.values, 2, axis=axis)).max() for axis in (0, 1))
     assert np.abs(off).max() < 2.0 * bend / 8.0
 

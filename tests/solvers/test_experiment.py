@@ -1,5 +1,6 @@
 """A layer and a deformable sample pressed together: closed forms, balance, and references of CalculiX."""
 
+import dataclasses
 import json
 
 import jax
@@ -68,6 +69,12 @@ def test_action_is_reaction(confined):
     total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
     assert np.abs(total).max() < 1e-6 * np.abs(stats["force_window"]).max()
     np.testing.assert_allclose(stats["force_plate"][2], stats["force_sample"][2], rtol=1e-6)
+
+
+def test_bonded_bodies_are_refused_before_anything_is_compiled():
+    bonded = dataclasses.replace(stack(), interface=op.Bonded())
+    with pytest.raises(ValueError, match="interface=Bonded"):
+        op.solve(bonded, op.Compression(0.1))
 
 
 def law(numbers):
