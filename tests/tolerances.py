@@ -10,7 +10,7 @@ FINITE_DIFFERENCE = 1e-5
 """A central difference against a derivative, float64."""
 
 SOLVER = 1e-7
-"""Ten times the relative tolerance (1e-8) that the iterative solvers stop at by default."""
+"""Ten times the relative tolerance (1e-8) that the test asks of the iterative solver."""
 
 RATE = 0.1
 """How far a measured convergence rate may be from its theory; the size of the error is not asserted."""

@@ -41,9 +41,9 @@ _VISCOUS_RTOL = 1e-6
 _VISCOUS_STEPS = 12
 # Solves of one snap before it is given up.
 _SNAP_SOLVES = 80
-# Gap of hard contact that counts as none, over the size of an element; and the share of it that an
-# increment at full load must take away to be followed by another.
-_NO_GAP = 1e-7
+# Gap of hard contact that counts as none, over the size of an element: 1 nm, as well as the phase of OCT tells; and the
+# share of it that an increment at full load must take away to be followed by another.
+_NO_GAP = 1e-5
 _LEAST_SETTLING = 0.5
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4

@@ -10,6 +10,7 @@ from tests.experiments import flat_map, published_palpation
 C10, C01, BULK = 2.2e-3, 7.03e-4, 0.11612  # MPa; VALIDATION.md, MR20
 MATERIAL = op.MooneyRivlin(c10=C10, c01=C01, bulk=BULK)
 WIDE = (5.0, 5.0)  # mm
+ACCURATE = op.Newton(rtol=1e-8)
 
 
 def cauchy(axial: float, lateral: float) -> np.ndarray:
@@ -35,7 +36,7 @@ def test_07_08_uniform_compression(sides, element):
     """VALIDATION.md tests 7 and 8: lubricated and confined compression."""
     palpation = published_palpation(0.0, 0.0, MATERIAL, extent=WIDE, sides=sides, element=element)
     for stretch in (0.9, 0.8, 0.7, 0.6, 0.5):
-        solution = op.solve(palpation, op.Imprint(flat_map(0.5 * stretch, WIDE)))
+        solution = op.solve(palpation, op.Imprint(flat_map(0.5 * stretch, WIDE)), ACCURATE)
         u = np.asarray(solution.displacement)
         reached = 1.0 + float(np.mean(u[2, -1] - u[2, 0])) / 0.5
         sunk = float(solution.stats["max_penetration"]) / 0.5  # into the window: elements are flat
@@ -51,7 +52,7 @@ def test_30_friction_bracket():
     """VALIDATION.md test 30: the force between flat plates rises from free spreading to a bonded layer."""
     flat = op.Imprint(flat_map(0.45, WIDE))
     solutions = [
-        op.solve(published_palpation(friction, friction, MATERIAL, extent=WIDE), flat)
+        op.solve(published_palpation(friction, friction, MATERIAL, extent=WIDE), flat, ACCURATE)
         for friction in (0.0, 0.01, 0.05, 0.12, 0.3, 1.0)
     ]
     forces = np.array([-float(s.stats["force_sample"][2]) for s in solutions])
@@ -122,6 +123,6 @@ def test_traction_with_friction_resists_spreading():
 
 
 def test_uniform_frictionless_layer_needs_no_hold():
-    solution = op.solve(published_palpation(0.0, 0.0), op.Imprint(flat_map(0.45)))
+    solution = op.solve(published_palpation(0.0, 0.0), op.Imprint(flat_map(0.45)), ACCURATE)
     assert bool(solution.result == op.RESULTS.successful)
     assert np.abs(np.asarray(solution.stats["force_hold"])).max() < 1e-10
