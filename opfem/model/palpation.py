@@ -37,6 +37,8 @@ class Palpation(eqx.Module):
             worse than "full") and "tet10" (quadratic, six to 2×2×2 elements with their nodes: nx, ny, nz even).
             Contact pushes tetrahedra at their nodes with the share of their triangles; in "tet10" only middles
             of edges have one, and a layer squeezed to 60% between rollers does not converge.
+        side_contact: Whether window and sample push the layer's free sides where they bulge onto them; `Explicit` never
+            does, as in the published decks. Without, `stats["side_overlap"]` says how far sides reach into a body.
         hold: What keeps a layer in place that friction cannot. None: its mean in-plane motion and
             rotation at the window are held, until friction can carry what the hold carries. A number
             [N/mm]: a uniform in-plane spring under the whole layer instead, so that it can drift.
@@ -52,6 +54,7 @@ class Palpation(eqx.Module):
     sample: Side
     sides: tuple[str, str, str, str] = eqx.field(static=True)
     element: Element = eqx.field(static=True)
+    side_contact: bool = eqx.field(static=True)
     hold: Array | None = eqx.field(metadata={"unit": "N/mm"})
 
     def __init__(
@@ -64,6 +67,7 @@ class Palpation(eqx.Module):
         sides: str | Mapping[str, str] | tuple[str, str, str, str] = "free",
         element: Element = "mean_dilatation",
         hold=None,
+        side_contact: bool = True,
     ):
         if not isinstance(layer, Layer):
             raise ValueError(f"Palpation.layer must be a Layer, got {type(layer).__name__}.")
@@ -99,6 +103,7 @@ class Palpation(eqx.Module):
         self.sample = sample
         self.sides = named_sides("Palpation", sides)
         self.element = element
+        self.side_contact = bool(side_contact)
         self.hold = hold
 
     def __pdoc__(self, **options: Any) -> Any:

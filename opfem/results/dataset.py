@@ -44,6 +44,7 @@ STATS = {
     "work_window": ("N mm", "work of the window on the layer"),
     "approach": ("mm", "approach of sample and layer that the contact law itself causes"),
     "max_penetration": ("mm", "largest penetration"),
+    "side_overlap": ("mm", "how far sides of the layer reach into the window or the sample"),
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
     "min_stretch": ("1", "smallest principal stretch in the layer, volume change taken out"),
     "max_stretch": ("1", "largest principal stretch in the layer, volume change taken out"),

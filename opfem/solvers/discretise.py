@@ -70,7 +70,8 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         return ContactFace(contact, surface, offset, imposed, mesh.element_size, stiffness, above, rule, shares=shares)
 
     def with_sides(face: ContactFace | None) -> ContactFace | None:
-        if face is None or face.imposed is not None or palpation.sides == ("roller",) * 4:
+        free = palpation.side_contact and palpation.sides != ("roller",) * 4
+        if face is None or face.imposed is not None or not free:
             return face
         sides = jnp.asarray(is_side((nz, ny, nx)))
         whole = None if shares is None else jnp.pad(shares, ((0, 0), (0, sides.size - ny * nx)), constant_values=1.0)

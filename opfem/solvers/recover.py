@@ -5,10 +5,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
-from ..mechanics.boundary import Body, Touching, put, take, to_touching
+from ..mechanics.boundary import Bodies, Body, Touching, put, take, to_touching
 from ..mechanics.contact_state import PointContact
 from ..mechanics.face import (
     area_vector,
@@ -64,6 +65,7 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         "friction_dissipation": sum(dissipated, start=jnp.zeros((), u.dtype)),
         "approach": sample_stats["approach"],
         "max_penetration": jnp.maximum(sample_stats["max_penetration"], window_stats["max_penetration"]),
+        "side_overlap": side_overlap(problem, state),
         "min_volume_ratio": forces.smallest_J,
     }
     top = problem.body.cells.element_mean(stress[2, 2], problem.body.field_volume())[-1]
@@ -75,6 +77,17 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
         reached_stretches(problem, u),
         stats,
     )
+
+
+def side_overlap(problem: Problem, state: State) -> Array:
+    """Find how far the layer's sides reach into the window or the sample [mm]."""
+    deepest = jnp.zeros((), state.u.dtype)
+    for body, face in zip(Bodies._fields, problem.contacts, strict=True):
+        if face is not None and face.imposed is None:
+            corners = take(problem.positions + state.u, body, with_sides=True)
+            sides = corners[..., int(np.prod(problem.elements[1:])) :]
+            deepest = jnp.maximum(deepest, -jnp.min(face.clearance(face.locate(state.fraction, sides))))
+    return deepest
 
 
 def reached_stretches(problem: Problem, u: Array) -> dict[str, Array]:

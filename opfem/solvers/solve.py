@@ -84,7 +84,7 @@ def solve(
         `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
         the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N mm] about the origin,
         `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
-        `max_penetration` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
+        `max_penetration` and `side_overlap` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
         stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
         law is unstable, 0 if it was stable as far as it was stretched). Of an experiment `force_sample`
         is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.

@@ -8,7 +8,7 @@ import pytest
 
 import opfem as op
 from tests.experiments import ELEMENTS, EXTENT, L0, MATERIAL, bumpy_map, flat_map, published_palpation
-from tests.tolerances import SOLVER
+from tests.tolerances import ROUNDOFF, SOLVER
 
 INTERFACE = (ELEMENTS[1] + 1, ELEMENTS[0] + 1)  # nodes
 
@@ -260,3 +260,22 @@ def test_contradicting_load_and_sample_are_refused():
         op.solve(published_palpation(), op.Displacement(-0.05))
     with pytest.raises(ValueError, match=r"Displacement\.uz \[mm\] must be .*\(7, 7\), got \(3, 3\)"):
         op.solve(published_palpation(0.1, 0.0), op.Displacement(np.full((3, 3), -0.05)))
+
+
+def test_sides_that_touch_nothing_reach_into_the_body_they_fold_onto():
+    from opfem.solvers.discretise import discretise
+    from opfem.solvers.recover import side_overlap
+
+    load = op.Imprint(flat_map(0.9 * L0))
+    touching, passing = (
+        discretise(published_palpation(side_contact=touch), load, None, "gauss2") for touch in (True, False)
+    )
+    assert touching.contacts.window.sides is not None
+    assert passing.contacts.window.sides is None
+    assert passing.contacts.sample.sides is None
+    state = passing.initial_state()
+    assert float(side_overlap(passing, state)) == 0.0
+    below = state.u.at[2, 1, 0].set(-0.5 * L0 - 0.01)  # the middle of the southern side, 0.01 mm under the window
+    folded = eqx.tree_at(lambda s: s.u, state, below)
+    upper_point = 0.5 + 0.5 / np.sqrt(3.0)  # of 2 × 2 Gauss points between the window's edge and there
+    assert float(side_overlap(passing, folded)) == pytest.approx(0.01 * upper_point, rel=ROUNDOFF)
