@@ -125,7 +125,7 @@ def measure(chosen: argparse.Namespace) -> dict:
         "friction": chosen.friction,
         "side_contact": chosen.side_contact,
         "solver": type(solver).__name__,
-        "strain": float(1.0 - np.asarray(load.thickness.values).min() / np.max(palpation.layer.thickness)),
+        "strain": float(1.0 - np.asarray(load.thickness.values).min() / np.max(np.asarray(palpation.mesh().thickness))),
         "slope": steepest(load.thickness),
         "message": op.RESULTS[solution.result],
         "load_fraction": float(solution.last_converged.load_fraction),
