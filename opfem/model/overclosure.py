@@ -24,7 +24,7 @@ _INVERSE_STEPS = 8
 # Penalty over element stiffness where multipliers carry the pressure, and where nothing does. A layer off whose window
 # two corners lift (50×50×4 elements) takes 11, 13, 13, 15, 15 and 38 increments at 3, 5, 10, 15, 20 and 30, and fails
 # at 1000; the coin on 40×40×4 elements takes 84, 79, 74, 74, 74 and 74 Newton steps.
-_EXACT_RATIO, _PENALTY_RATIO = 10.0, 1000.0
+_EXACT_RATIO, _PENALTY_RATIO = 5.0, 1000.0
 
 
 class AbstractOverclosure(eqx.Module):

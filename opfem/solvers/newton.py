@@ -66,7 +66,7 @@ class Newton(eqx.Module):
     increments: float | int | Array = 8
     max_steps: float | int | Array = 20
     min_increment: float | int | Array = 1e-4
-    krylov_rtol: float | int | Array = 3e-2
+    krylov_rtol: float | int | Array = 1e-2
     krylov_steps: float | int | Array = 120
     max_backtracks: float | int | Array = 6
     step_limit: float | int | Array = 0.025
