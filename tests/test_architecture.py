@@ -13,13 +13,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "opfem"
 CHAIN = ("measurement", "model", "mechanics", "solvers", "inverse", "results")
-EVERYONE = {"_types", "_checks", "_repr"}
+EVERYONE = {"_types", "_checks", "_repr", "_device"}
 
 MAY_IMPORT = {stage: set(CHAIN[: place + 1]) for place, stage in enumerate(CHAIN)}
 MAY_IMPORT |= {
     "_types": set(),
     "_checks": set(),
     "_repr": set(),
+    "_device": set(),
     "compilation": set(),
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},

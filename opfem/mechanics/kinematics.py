@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ..model import BlockMesh, LayerMesh
 from ..model.deformation import ProductSum
 from .hex8 import CORNERS, GAUSS_POINTS, GRADIENTS, assemble, gather
-from .staging import apart
+from .staging import apart, mapped
 from .tet import EDGES, FOUR_POINTS, kuhn_tetrahedra, linear_gradients, quadratic_gradients
 
 
@@ -216,7 +216,7 @@ class LayerCells(AbstractCells):
             return contract(self.kind.pairs, A.reshape(-1, *A.shape[3:]))
 
         rows, columns = np.triu_indices(3)
-        upper = jax.lax.map(block, np.stack([rows, columns], axis=1))
+        upper = mapped(block, np.stack([rows, columns], axis=1))
         place = {(i, k): at for at, (i, k) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
         lower = jnp.swapaxes(upper, 1, 2)
         blocks = [[upper[place[i, k]] if i <= k else lower[place[k, i]] for k in range(3)] for i in range(3)]
@@ -244,7 +244,7 @@ class LayerCells(AbstractCells):
             cells = LayerCells(self.spacing, own, slope_x, slope_y, self.name)
             return finish(cells, apart(at_gradient, cells, nodal, *rest))
 
-        results = jax.lax.map(one_layer, flat)
+        results = mapped(one_layer, flat)
         return jax.tree.map(lambda v: v.reshape(*v.shape[:-3], ny, nx), results)
 
     def element_mean(self, values: Float[Array, "*components points cz cy cx"], volume: Array) -> Array:

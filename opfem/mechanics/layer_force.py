@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._device import choices
 from ..model.deformation import inverse_cube_root
 from ..model.material import AbstractInvariantMaterial
 from .hex8 import _GAUSS, pad_axis
@@ -57,7 +58,7 @@ class LayerForce(eqx.Module):
         if not _is_fast(self.body):
             return self.body.internal_force_with(u, lambda change: extra_stress(change, *fields))
         nz, ny, nx = (n - 1 for n in u.shape[1:])
-        rows = _block_rows(nz * nx, ny)
+        rows = _block_rows(nz * nx, ny) if choices().one_by_one else ny
         if rows == ny:
             return self._of_rows(u, extra_stress, fields)
 

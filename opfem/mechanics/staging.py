@@ -10,6 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from .._device import choices
+
 
 def apart(function: Callable, *args: Any) -> Any:
     """Evaluate a function of PyTrees of arrays, storing its arguments before and its results after.
@@ -17,11 +19,13 @@ def apart(function: Callable, *args: Any) -> Any:
     Nothing is fused across a conditional. This one has a known predicate, hidden from the compiler; so it stays
     one condition for all lanes under `jax.vmap`. GPUs fuse better and would wait for the predicate: no border there.
     """
-    function = jax.jit(function)  # traced once for both
+    if not choices().bordered:
+        return function(*args)
+    results = jax.eval_shape(function, *args)
+    never = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), results)
+    return jax.lax.cond(jax.lax.optimization_barrier(jnp.asarray(True)), function, lambda *_: never, *args)
 
-    def bordered(*args):
-        results = jax.eval_shape(function, *args)
-        never = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), results)
-        return jax.lax.cond(jax.lax.optimization_barrier(jnp.asarray(True)), function, lambda *_: never, *args)
 
-    return jax.lax.platform_dependent(*args, cpu=bordered, default=function)
+def mapped(function: Callable, values: Any) -> Any:
+    """Apply a function along the first axis of a PyTree of arrays: on a CPU one entry after the other."""
+    return jax.lax.map(function, values) if choices().one_by_one else jax.vmap(function)(values)

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from .._device import choices
+
 # On a CPU. LLVM's first level instead of its third, and the older of XLA's two code generators: together a load
 # increment of the coin on 40×40×4 elements compiles in 7 CPU seconds instead of 15, and runs 8 % longer (4.0 s).
 _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
@@ -30,7 +32,7 @@ def compiler_options() -> dict[str, Any]:
         Those that this version of XLA knows, for the default device; on other devices than CPUs none.
     """
     known = {}
-    for name, value in _QUICK.items() if jax.default_backend() == "cpu" else ():
+    for name, value in _QUICK.items() if choices().compiles_slowly else ():
         try:
             jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
         except jax.errors.JaxRuntimeError:  # "No such compile option"

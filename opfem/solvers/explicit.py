@@ -306,7 +306,7 @@ def _run_on_host(
         history = history.at(k + 1, motion, _energies(dynamics, motion), interval / steps, steps)
         if keeper is not None:
             keeper[0].keep(keeper[1], (motion, history, jnp.asarray(k + 1)))
-        bar.show(f"time {100 * (k + 1) / count:.0f} %, {int(history.steps)} increments", (k + 1) / count)
+        bar.show(f"time {100 * (k + 1) / count:.0f} %, {int(history.steps)} increments", (k + 1) / count, estimate=True)
     return motion, history
 
 

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedCol
 _TICK = 0.25  # [s] between looks at what XLA does and how late it is
 _EVERY = 8.0  # [s] between lines of a log: none is silent for 10 s
 _PATIENCE = 5.0  # [s] that a stage of a library call takes before a log hears of it
+_LONG = 20.0  # [s] from which on it is said how long is left
 _NOTABLE = 3.0  # [s] of one compilation before it is mentioned; one that is kept on disk is read in less
 
 # Compilations under way, by thread: when each began.
@@ -85,14 +86,17 @@ class Progress:
         if self._display is not None:
             self._display.begin(text, compiles)
 
-    def show(self, text: str, fraction: float | None = None) -> None:
+    def show(self, text: str, fraction: float | None = None, *, estimate: bool = False) -> None:
         """Say how far the stage is.
 
         Args:
             text: What there is to say.
             fraction: Part of the stage that is done [-], where it is known.
+            estimate: Say, too, how long the stage may still take, where that is long.
         """
         if self._display is not None:
+            if estimate and fraction is not None:
+                text += self._display.time_left(fraction)
             self._display.put(self._display.now._replace(text=text, fraction=fraction))
 
 
@@ -107,6 +111,7 @@ class _Display:
         self._patience = 0.0 if at_once else _PATIENCE
         self._count = 0
         self._said: tuple[int, bool] = (0, False)  # the stage of the last line, and whether it said "compiling"
+        self._paced: tuple[int, float, float] | None = None  # stage, and when a fraction of it was first heard of
         self._bar: Bar | None = None
         self._handle: Any = None
         self._written = ""
@@ -128,6 +133,18 @@ class _Display:
         """Begin a stage."""
         self._count += 1
         self.put(_Now(text, None, compiles, self._count, self._time()))
+
+    def time_left(self, fraction: float) -> str:
+        """Say how long the stage may still take, at the pace since it was first heard of: what compiles is before."""
+        time, stage = self._time(), self.now.stage
+        if self._paced is None or self._paced[0] != stage or fraction <= self._paced[2]:
+            self._paced = (stage, time, fraction)
+            return ""
+        _, since, done = self._paced
+        left = (1.0 - fraction) * (time - since) / (fraction - done)
+        if left < _LONG:
+            return ""
+        return f", about {left:.0f} s left" if left < 100.0 else f", about {left / 60.0:.0f} min left"
 
     def put(self, now: _Now) -> None:
         """Show something else."""

@@ -18,6 +18,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
+from .._device import choices
 from .outputs import ERROR, NONFINITE, STATUS, Label, OutputError, Outputs, ending
 from .plan import Plan, check_settings, settled
 from .store import Outcome
@@ -149,7 +150,7 @@ class Batch:
 
     def run(self, program: Program, batches: Iterator[tuple[range, Columns]]):
         """Yield each batch's points and outcomes, in the order in which they finish."""
-        threads = self.threads or (_cores() if jax.default_backend() == "cpu" else 1)
+        threads = self.threads or (_cores() if choices().threads else 1)
         yield from side_by_side(program.outcomes, batches, threads)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any, Literal, get_args
 
-import jax
+from .._device import choices
 
 Mode = Literal["auto", "map", "vmap", "call"]
 # Points per batch of `vmap` where the user says nothing.
@@ -34,7 +34,7 @@ class Plan:
 def settled(size: int | None, mode: str, devices: int, begun: Plan | None) -> Plan:
     """Choose what is left open: as begun, else `map` on CPU and `vmap` elsewhere; benchmarks/sweep.py measures both."""
     if mode == "auto":
-        mode = begun.mode if begun is not None else "map" if jax.default_backend() == "cpu" else "vmap"
+        mode = begun.mode if begun is not None else "map" if choices().threads else "vmap"
     if mode == "call":
         return Plan(mode, 1)
     default = begun.size if begun is not None else _VMAP_SIZE if mode == "vmap" else 8 if devices > 1 else 1

@@ -4,7 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from opfem.mechanics.staging import apart
+import opfem as op
+from opfem import _device
+from opfem.mechanics.internal import layer_body
+from opfem.mechanics.layer_force import LayerForce
+from opfem.mechanics.staging import apart, mapped
+from opfem.solvers.multigrid import apply_multigrid, build_multigrid
 from tests.tolerances import ROUNDOFF
 
 
@@ -36,3 +41,21 @@ def test_the_compiler_keeps_the_border_on_cpu():
     assert "conditional(" in compiled.as_text()
     batched = jax.jit(jax.vmap(lambda x: apart(jnp.sin, x + 1.0) + 1.0)).lower(jnp.ones((4, 1000))).compile()
     assert "conditional(" in batched.as_text()
+
+
+def test_an_accelerator_s_program_gives_what_the_cpu_s_does(monkeypatch):
+    palpation = op.Palpation(op.Layer(0.5, op.NeoHooke(2.9e-3, 0.1)), (1.0, 0.8), (7, 5, 2), op.Bonded(), op.Bonded())
+    mesh = palpation.mesh()
+    body = layer_body(mesh, palpation.layer.material, palpation.element)
+    u = 0.01 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.positions().shape))
+
+    def evaluate(u):
+        force, _ = LayerForce(body, True)(u, jnp.zeros_like)
+        K = body.cell_stiffness(u, more=1e-3 * jnp.eye(24).reshape(8, 3, 8, 3).swapaxes(1, 2))
+        return force, K, apply_multigrid(build_multigrid(K, None, jnp.asarray(0.01)), u), mapped(jnp.sum, u)
+
+    on_cpu = jax.jit(evaluate)(u)
+    monkeypatch.setattr(_device, "CPU", _device.ACCELERATOR)
+    as_on_gpu = jax.jit(lambda u: evaluate(u))
+    for ours, theirs, scale in zip(as_on_gpu(u), on_cpu, (ROUNDOFF, ROUNDOFF, 1e-3, ROUNDOFF), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=scale * float(jnp.abs(theirs).max()))

@@ -123,3 +123,16 @@ def test_an_error_ends_it(capsys):
     with Progress(True, at_once=True) as another:
         another.stage("reading")
     assert lines(capsys) == ["reading"]
+
+
+def test_long_work_says_how_long_is_left(monkeypatch):
+    clock = iter((0.0, 0.0, 0.0, 10.0, 60.0, 80.0))
+    monkeypatch.setattr(progress._Display, "_time", lambda self: next(clock))
+    monkeypatch.setattr(progress._Display, "_keep_up", lambda self: None)
+    said = []
+    monkeypatch.setattr(progress._Display, "put", lambda self, now: said.append(now.text) or setattr(self, "now", now))
+    with Progress(True) as shown:
+        shown.stage("solver")
+        for fraction in (0.0, 0.125, 0.25, 0.75):
+            shown.show("load", fraction, estimate=True)
+    assert said == ["solver", "load", "load, about 70 s left", "load, about 3 min left", "load, about 27 s left"]
