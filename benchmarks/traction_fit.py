@@ -104,10 +104,9 @@ def truth_case() -> None:
     truth = jnp.asarray(lobes(*map(np.asarray, coarse.mesh().plane())))
     prior = op.Matern(length=0.5, std=1.5e-3, mean=3e-3)
     begin = time.perf_counter()
-    first = op.fit_traction(coarse, measured, prior, draws=2)
+    first = op.fit_traction(coarse, measured, prior, model_std=0.0, draws=2)
     seconds = time.perf_counter() - begin
-    model_std = jnp.sqrt(jnp.mean(op.mesh_error(first.solution) ** 2))
-    fit = op.fit_traction(coarse, measured, prior, model_std=model_std, draws=32)
+    fit = op.fit_traction(coarse, measured, prior, draws=32)
     imprint = op.solve(coarse, op.Imprint(measured.smoothed(fwhm=ELEMENT)))
     linear, uniaxial = op.linear_estimate(coarse, measured, prior), op.uniaxial_estimate(coarse, measured)
     inside = jnp.abs(fit.normal - truth) < 1.96 * fit.normal_std
@@ -117,7 +116,7 @@ def truth_case() -> None:
                 "strain": round(1.0 - float(measured.values.min()) / THICKNESS, 3),
                 "fit": error(fit.normal, truth),
                 "without_model_std": error(first.normal, truth),
-                "model_std_um": round(1e3 * float(model_std), 2),
+                "model_std_um": round(1e3 * float(fit.stats["model_std"]), 2),
                 "imprint": error(-imprint.traction[2], truth),
                 "linear": error(linear.normal, truth),
                 "uniaxial": error(uniaxial, truth),
@@ -316,7 +315,8 @@ def coverage_case(fits: int, first: int, believed: float) -> None:
         truth = prior_field(palpation, prior, seed=1000 + index)
         solution = op.solve(palpation, op.Traction(truth), settings, throw=False, progress=False)
         measured = as_map(surface(palpation, solution, 49), side, seed=index)
-        fit = op.fit_traction(assumed, measured, prior, solver=settings, draws=1, throw=False, progress=False)
+        options = {"solver": settings, "draws": 1, "throw": False, "progress": False}
+        fit = op.fit_traction(assumed, measured, prior, model_std=0.0, **options)
         row = {"index": index, "message": op.FitStatus[fit.result]}
         if bool(fit.result == op.FitStatus.successful):
             # As smooth as the traction, so that it is neither all noise nor all prior.
@@ -436,8 +436,9 @@ def parameters_case(fits: int) -> None:
         maps = [as_map(heights, side, seed=100 * index + i) for i, heights in enumerate(surfaces)]
         readings = [op.ForceReading(f * (1.0 + 0.01 * rng.standard_normal()), 0.01 * f) for f in forces]
         fit = op.fit_traction(
-            palpation, maps, wide, parameters=parameters, forces=readings, solver=settings, draws=1, progress=False
-        )
+            palpation, maps, wide, parameters=parameters, forces=readings, model_std=0.0, solver=settings, draws=1,
+            progress=False,
+        )  # fmt: skip
         intervals = fit.number_intervals()
         for name, (low, high) in intervals.items():
             inside[name] += low <= known[name] <= high

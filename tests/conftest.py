@@ -80,10 +80,7 @@ def solution(loaded):
 @pytest.fixture(scope="session")
 def truth():
     """The small virtual experiment, pressed by 0.2 mm."""
-    jaxtyping.config.update("jaxtyping_disable", True)  # annotations of `solve` do not know experiments yet
-    solved = op.solve(inclusion_experiment(), op.Compression(0.2))
-    jaxtyping.config.update("jaxtyping_disable", False)
-    return solved
+    return op.solve(inclusion_experiment(), op.Compression(0.2), op.Newton(rtol=1e-8))
 
 
 @pytest.fixture(scope="session")

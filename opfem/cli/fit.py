@@ -121,6 +121,7 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
         "effective_dof": float(fitted.effective_dof),
         "observed_dof": float(fitted.observed),
         "residual_rms_um": 1e3 * float(stats["misfit_rms"]),
+        "model_std_um": 1e3 * float(stats["model_std"]),
         "representation_rms_um": 1e3 * float(stats["representation_rms"]),
         "resolution_um": [1e3 * float(width) for width in fitted.resolution_width],
         "prior_length_mm": float(prior.length),
@@ -160,6 +161,7 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
         ("largest pressure", f"{numbers['pressure_max_kPa']:.3g}", "kPa"),
         ("its standard deviation, mean", f"{numbers['pressure_std_mean_kPa']:.2g}", "kPa"),
         ("resolution", f"{sorted(numbers['resolution_um'])[len(numbers['resolution_um']) // 2]:.0f}", "µm"),
+        ("thickness that the mesh misses", f"{numbers['model_std_um']:.2g}", "µm"),
         ("χ² per degree of freedom", f"{numbers['reduced_chi2']:.2f}", ""),
         (
             "forward solves, inner iterations",

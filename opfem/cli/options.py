@@ -292,12 +292,13 @@ class FitOptions:
     ] = "given"
     nonnegative: Annotated[bool, Parameter(help="Keep the pressure above zero.")] = False
     model_std: Annotated[
-        float,
+        float | None,
         Parameter(
-            help="Standard deviation of the computed thickness in mm, what the mesh is off; see op.mesh_error.",
+            help="Standard deviation of the computed thickness in mm, what the mesh is off. Default: from a solve on "
+            "half the mesh (op.mesh_error).",
             validator=not_negative("mm"),
         ),
-    ] = 0.0
+    ] = None
     friction_spread: Annotated[
         float | None,
         Parameter(

@@ -265,7 +265,7 @@ def _side(section: str, given: Mapping[str, Any]) -> Side:
     if law == "linear" and "stiffness" not in given:
         raise ValueError(f"[{section}] law 'linear' needs stiffness [MPa/mm].")
     makers: dict[str, Callable[[], Any]] = {
-        "hard": lambda: HardOverclosure(exact=given.get("exact", False)),
+        "hard": lambda: HardOverclosure(exact=given.get("exact", True)),
         "exponential": lambda: ExponentialOverclosure(*({**_PUBLISHED, **given}[name] for name in ("p0", "c0"))),
         "linear": lambda: LinearOverclosure(given["stiffness"]),
     }

@@ -16,7 +16,7 @@ from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
 from ..model import Contact, Palpation
-from ..solvers import Newton, Solution
+from ..solvers import ConvergenceError, Newton, Solution
 from ..solvers.compiling import QuickJit, compiled_meanwhile
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
@@ -28,6 +28,7 @@ from .hyperparameters import most_likely, next_factor, rescaled
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
 from .jacobian import Point, programs
 from .misfit import Misfit, carried, moved, number_covariance, pressure_change
+from .model_error import can_halve, mesh_error
 from .observation import observe
 from .parameters import AbstractNumberPrior
 from .posterior import MOST_ITERATIONS, Posterior
@@ -55,6 +56,7 @@ _SOFTNESS = 0.05
 _DRAWS_AT_ONCE = 2
 # What compiles, for the progress line.
 _COMPILES = "the programs of a fit, about a minute the first time"
+_COMPILES_HALF = "the solver on half the mesh, about 10 s the first time"
 # Fits that look for a prior's hyper-parameters: most of them, and the relative change that ends them.
 _MOST_CHOICES = 8
 _CHOSEN = 0.05
@@ -70,7 +72,7 @@ def fit_traction(
     inside: AxialDisplacement | Sequence[AxialDisplacement] | None = None,
     lateral: AbstractPrior | ArrayLike | None = None,
     nonnegative: bool = False,
-    model_std: ScalarLike = 0.0,
+    model_std: ScalarLike | None = None,
     hyperparameters: Choice = "given",
     start: ArrayLike | None = None,
     solver: Newton = Newton(max_path=12),
@@ -102,8 +104,9 @@ def fit_traction(
             as well. A thickness map says little of it: `stats["lateral_informed"]` of the fit tells how much.
         nonnegative: Keep the pressure above zero.
         model_std: Standard deviation of the computed height [mm], independent from element to element: what the mesh
-            misses, above all. Pixels are many, so that without it a coarse mesh is believed more than it deserves; a
-            solve of the fit's traction on half the mesh tells how much it is (`mesh_error`).
+            misses, above all. Pixels are many, so that without it a coarse mesh is believed more than it deserves.
+            None: the root mean square of `mesh_error` under the traction of a first fit, which then goes on; 0 where
+            it cannot be estimated, for an odd or small number of elements along an axis. `stats["model_std"]` says it.
         hyperparameters: "given": the prior as it is. "discrepancy": its standard deviation (or weight) so that χ² of
             the map is what its noise makes it, the strongest prior that the data allow. "evidence": standard deviation
             and length so that the data are most likely (Laplace).
@@ -135,7 +138,8 @@ def fit_traction(
     require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=solver.as_leaves())
     check_inputs(palpation, maps, prior, lateral, parameters, as_tuple(inside))
     several = not isinstance(thickness, ThicknessMap)
-    observations = _observe(palpation.mesh(), *stacked_maps(maps), as_leaf(model_std, "fit_traction.model_std", "mm"))
+    known_std = as_leaf(0.0 if model_std is None else model_std, "fit_traction.model_std", "mm")
+    observations = _observe(palpation.mesh(), *stacked_maps(maps), known_std)
     check_covered(maps, observations)
     misfit = Misfit(
         palpation=palpation,
@@ -158,6 +162,8 @@ def fit_traction(
         with compiled_meanwhile(programs(misfit, misfit.white(observations.surface))):
             bed = None if nonnegative else lay_bed(misfit.bed, palpation, observations, solver)
         reached = _settle(run, bed, given)
+        if model_std is None and not _failed(reached):
+            reached = _allowing_for_the_mesh(run, reached, maps)
         if not _failed(reached) and hyperparameters != "given":
             reached = _choose(run, reached, hyperparameters, draws, key)
         if throw and _failed(reached):
@@ -275,6 +281,22 @@ def _settle(run: _Run, bed: Bed | None, given: Unknowns | None) -> _Reached:
     return reached
 
 
+def _allowing_for_the_mesh(run: _Run, reached: _Reached, maps: Sequence[ThicknessMap]) -> _Reached:
+    """Go on with what the mesh misses counted as noise; as it was where that cannot be estimated."""
+    misfit = run.misfit
+    if not can_halve(misfit.palpation.elements):
+        return reached
+    run.bar.stage("mesh error", compiles=_COMPILES_HALF)
+    try:
+        errors = [mesh_error(way.solution(misfit.solver), misfit.solver) for way in reached.point.ways]
+    except ConvergenceError:
+        return reached
+    model_std = jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2))
+    observations = _observe(misfit.palpation.mesh(), *stacked_maps(maps), model_std)
+    run.misfit = eqx.tree_at(lambda m: m.observations, misfit, observations)
+    return run.fit(reached.white)
+
+
 _observe = QuickJit(jax.vmap(observe, in_axes=(None, 0, 0, None)))
 
 
@@ -354,6 +376,7 @@ def _result(reached: _Reached, run: _Run, several: bool, draws: int, key: PRNGKe
             "draws_cut_short": cut_short,
             "std_error": 1.0 / (2.0 * draws) ** 0.5,
             "representation_rms": jnp.sqrt(jnp.mean(misfit.observations.representation_rms**2)),
+            "model_std": misfit.observations.model_std[0],
             "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
             **misfit.informed(whites),
         },

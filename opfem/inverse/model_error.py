@@ -29,20 +29,28 @@ def mesh_error(solution: Solution, solver: Newton = Newton()) -> Float[Array, "h
         Height on the mesh minus true height [mm], at every other node of the interface.
 
     Raises:
-        ValueError: If the load is no `Traction`, or the number of elements along an axis is odd.
+        ValueError: If the load is no `Traction`, or the number of elements along an axis is odd or below 8 (x, y).
         ConvergenceError: If the solve on half the mesh fails.
     """
     palpation, load = solution.palpation, solution.load
     if not isinstance(load, Traction):
         raise ValueError(f"mesh_error needs a solve under a Traction, got {type(load).__name__}.")
-    if any(n % 2 for n in palpation.elements):
-        raise ValueError(f"mesh_error needs even numbers of elements (nx, ny, nz), got {palpation.elements}.")
+    if not can_halve(palpation.elements):
+        raise ValueError(
+            "mesh_error needs even numbers of elements (nx, ny, nz), 8 or more along x and y, got "
+            f"{palpation.elements}."
+        )
     nx, ny, nz = palpation.elements
     half = dataclasses.replace(palpation, elements=(nx // 2, ny // 2, nz // 2))
     dead = Traction(-solution.traction[2], load.lateral)
     coarse = solve(half, jax.tree.map(_every_other, dead), solver, progress=False)
     fine = interface_heights(palpation.mesh(), solution.displacement[:, -1])
     return (interface_heights(half.mesh(), coarse.displacement[:, -1]) - _every_other(fine)) / _SECOND_ORDER
+
+
+def can_halve(elements: tuple[int, int, int]) -> bool:
+    """Tell whether half as many elements make a mesh on which a surface can be looked at."""
+    return not any(n % 2 for n in elements) and min(elements[:2]) >= 8
 
 
 def _every_other(values: Array) -> Array:
