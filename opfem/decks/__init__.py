@@ -1,0 +1,5 @@
+"""Abaqus and CalculiX decks in and out: `read_inp`, `write_inp`, and CalculiX' results."""
+
+from .cards import DeckError as DeckError
+from .deck import Deck as Deck
+from .reading import read_inp as read_inp
