@@ -360,6 +360,47 @@ class SolverOptions:
     ] = None
 
 
+@Parameter(name="*", group=Group("Deck", sort_key=1))
+@dataclass(frozen=True)
+class DeckOptions:
+    """How a deck is taken."""
+
+    code: Annotated[
+        Literal["abaqus", "calculix"] | None,
+        Parameter(help="Whose deck it is: C3D8 and EXPONENTIAL mean different things. Default: as its keywords tell."),
+    ] = None
+    bulk: Annotated[
+        float | None,
+        Parameter(
+            help="Bulk modulus in MPa of materials with D = 0; inf for incompressible. Default: what the deck's own "
+            "code takes for it.",
+            validator=positive("MPa", infinite=True),
+        ),
+    ] = None
+    layer: Annotated[
+        str | None, Parameter(help="Instance that is the layer, where two bodies are soft and neither is called so.")
+    ] = None
+    interpolation: Annotated[
+        Literal["cubic", "catmull-rom", "bilinear"],
+        Parameter(help="How a rigid surface runs between its nodes; the deck's own facets are bilinear."),
+    ] = "cubic"
+    solver: Annotated[
+        Literal["deck", "newton", "explicit"],
+        Parameter(help="The deck's own kind of solver, implicit statics, or explicit dynamics as published."),
+    ] = "deck"
+    increments: Annotated[
+        int | None,
+        Parameter(
+            help="Load increments of newton in each step. Default: the solver's own.",
+            validator=count(),
+            converter=whole,
+        ),
+    ] = None
+    precision: Annotated[
+        Literal["float32", "float64"], Parameter(help="Precision of explicit; float32 takes half the time.")
+    ] = "float64"
+
+
 @Parameter(name="*", group=Group("Run", sort_key=6))
 @dataclass(frozen=True)
 class RunOptions:

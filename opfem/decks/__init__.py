@@ -3,3 +3,4 @@
 from .cards import DeckError as DeckError
 from .deck import Deck as Deck
 from .reading import read_inp as read_inp
+from .writing import write_inp as write_inp

@@ -65,6 +65,18 @@ class Body:
             found.append(self.corners[chosen][:, FACES[side - 1]])
         return np.concatenate(found)
 
+    def section(self, y: float) -> np.ndarray:
+        """Cut the body: corners x, z [mm] of the hexahedra that a plane at y goes through, `(k, 4, 2)`."""
+        if self.corners is None:
+            return np.zeros((0, 4, 2))
+        X = self.X[self.corners]  # element, corner, component
+        cut = X[(X[..., 1].min(axis=1) <= y) & (X[..., 1].max(axis=1) > y)]
+        near = np.argsort(cut[..., 1], axis=1, kind="stable")[:, :4]
+        flat = np.take_along_axis(cut, near[..., None], axis=1)[..., [0, 2]]
+        around = flat - flat.mean(axis=1, keepdims=True)
+        turn = np.argsort(np.arctan2(around[..., 1], around[..., 0]), axis=1)
+        return np.take_along_axis(flat, turn[..., None], axis=1)
+
     @cached_property
     def block(self) -> "Block":
         """The body as a block of hexahedra on a regular grid.

@@ -126,7 +126,7 @@ class Supports:
         high: Its upper face.
         sides: "free" or "roller" of x0, x1, y0, y1.
         pins: In-plane directions of single nodes that are held besides.
-        hold: Stiffness of springs to ground on its lower face [N/mm], in total; 0 without.
+        hold: Stiffness of springs to ground [N/mm], in total; 0 without.
     """
 
     low: Held
@@ -168,8 +168,8 @@ def supports(block: Block, deck: Deck) -> Supports:
         explained[where] |= rolls
         sides.append("roller" if rolls else "free")
     rest = mask & ~explained
-    pins = int(rest[0, ..., :2].sum())
-    if rest[1:].any() or rest[..., 2].any() or pins > _PINS:
+    pins = int(rest[[0, -1], ..., :2].sum())
+    if rest[1:-1].any() or rest[..., 2].any() or pins > _PINS:
         level, row, column, component = np.argwhere(rest)[0]
         number = body.numbers[block.nodes[level, row, column]]
         raise body.place.refuse(
@@ -181,7 +181,7 @@ def supports(block: Block, deck: Deck) -> Supports:
 
 
 def _hold(block: Block, deck: Deck) -> float:
-    """Add up the springs to ground on the lower face [N/mm]."""
+    """Add up the springs to ground [N/mm]."""
     body = block.body
     part = deck.parts[deck.instances[body.instance].part]
     stiffness = np.zeros(3)
@@ -190,8 +190,8 @@ def _hold(block: Block, deck: Deck) -> float:
             if elements.kind != "SPRING1":
                 continue
             own = body.index(elements.nodes[np.isin(elements.numbers, members), 0])
-            if not np.isin(own, block.nodes[0]).all():
-                raise elements.place.refuse(f"springs of {body.name} must stand on its face at the window.")
+            if not any(np.isin(own, block.nodes[side]).all() for side in (0, -1)):
+                raise elements.place.refuse(f"springs of {body.name} must stand on one of its faces.")
             stiffness[direction] += value * own.size
     if stiffness[2] or not np.isclose(stiffness[0], stiffness[1], rtol=1e-6):
         raise body.place.refuse(

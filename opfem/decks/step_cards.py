@@ -12,7 +12,7 @@ from .state import Keyword, State
 _HELD = {"ENCASTRE": (1, 2, 3), "PINNED": (1, 2, 3), "XSYMM": (1,), "YSYMM": (2,), "ZSYMM": (3,)}
 _LAST = 6  # direction, of rotations
 # Results that only CalculiX calls so.
-_CALCULIX = {"CDIS", "CSTR", "PEEQ/T", "ZZS"}
+_CALCULIX = {"CDIS", "CSTR", "ZZS"}
 
 
 def _step(card: Card, state: State) -> None:
@@ -164,6 +164,8 @@ def _output(card: Card, state: State) -> None:
 
 def _variables(card: Card, state: State) -> None:
     step = _own(card, state)
+    if "OUTPUT" in card.options:
+        state.calculix = state.calculix or card.place
     words = [word.upper() for _, fields in card.rows() for word in fields if word]
     if _CALCULIX & set(words):
         state.calculix = state.calculix or card.place
