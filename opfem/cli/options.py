@@ -360,6 +360,21 @@ class SolverOptions:
     ] = None
 
 
+@Parameter(name="*", group=Group("Deck", sort_key=5))
+@dataclass(frozen=True)
+class WriteOptions:
+    """A deck of the problem for another code."""
+
+    write_inp: Annotated[
+        Path | None,
+        Parameter(
+            help="File (.inp) to write the problem to, as a deck; it is written instead of solved, and needs no --out.",
+            validator=NewFile(".inp"),
+        ),
+    ] = None
+    code: Annotated[Literal["abaqus", "calculix"], Parameter(help="Whose deck it is.")] = "abaqus"
+
+
 @Parameter(name="*", group=Group("Deck", sort_key=1))
 @dataclass(frozen=True)
 class DeckOptions:
