@@ -24,6 +24,7 @@ from .options import (
     SolverOptions,
     StepOptions,
     VolumeOptions,
+    WriteOptions,
 )
 from .quantities import positive
 from .running import complain, reporting
@@ -80,6 +81,7 @@ def palpate(
     layer: LayerOptions = LayerOptions(),
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
+    deck: WriteOptions = WriteOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
@@ -89,7 +91,7 @@ def palpate(
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, run)
+        palpate(map, out, reading, layer, contact, solver, deck, run)
 
 
 @app.command
@@ -150,6 +152,7 @@ def simulate(
     /,
     *,
     out: _Out,
+    deck: WriteOptions = WriteOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
@@ -160,7 +163,7 @@ def simulate(
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, run)
+        simulate(scene, out, deck, run)
 
 
 @app.command

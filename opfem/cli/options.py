@@ -363,16 +363,24 @@ class SolverOptions:
 @Parameter(name="*", group=Group("Deck", sort_key=5))
 @dataclass(frozen=True)
 class WriteOptions:
-    """A deck of the problem for another code."""
+    """The problem as a deck for another code."""
 
     write_inp: Annotated[
         Path | None,
-        Parameter(
-            help="File (.inp) to write the problem to, as a deck; it is written instead of solved, and needs no --out.",
-            validator=NewFile(".inp"),
-        ),
+        Parameter(help="File (.inp) to write the problem to, too, before it is solved.", validator=NewFile(".inp")),
     ] = None
     code: Annotated[Literal["abaqus", "calculix"], Parameter(help="Whose deck it is.")] = "abaqus"
+    contact_stiffness: Annotated[
+        float | None,
+        Parameter(
+            help="Stiffness in MPa/mm of linear contact on all faces, solved and written: the only law of CalculiX.",
+            validator=positive("MPa/mm"),
+        ),
+    ] = None
+    stick_slope: Annotated[
+        float | None,
+        Parameter(help="Stiffness in MPa/mm of sticking friction, as CalculiX has it.", validator=positive("MPa/mm")),
+    ] = None
 
 
 @Parameter(name="*", group=Group("Deck", sort_key=1))
