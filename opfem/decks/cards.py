@@ -15,6 +15,7 @@ import numpy as np
 
 # Text of all files together; numbers and text of that much take 1.5 GB, of 50 MB some 0.2 GB.
 MAX_BYTES = 512 * 2**20
+_LARGEST = 1e15  # label that a float64 holds exactly
 _DEEPEST = 16  # files included by included files
 _KEYWORD = re.compile(rb"^[ \t]*\*(?!\*)[^\n]*", re.MULTILINE)
 _NO_DATA = re.compile(rb"^[ \t]*(?:\*\*[^\n]*)?(?:\n|\Z)", re.MULTILINE)
@@ -196,13 +197,12 @@ def number(word: str, card: Card, place: Place) -> float:
 
 def whole_numbers(values: np.ndarray, card: Card, place: Place) -> np.ndarray:
     """Turn labels of nodes or elements, read as numbers, into whole ones."""
-    labels = values.astype(np.int64)
-    wrong = (labels != values) | (labels < 1)
+    wrong = (values != np.rint(values)) | (values < 1) | (values > _LARGEST)
     if wrong.any():
         raise card.refuse(
             f": numbers of nodes and elements must be whole and positive, got {values[wrong][0]:g}.", place
         )
-    return labels
+    return values.astype(np.int64)
 
 
 def _shown(word: str) -> str:
