@@ -9,10 +9,10 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .deck_options import DeckOptions, WriteOptions
 from .messages import say
 from .options import (
     ContactOptions,
-    DeckOptions,
     FitLayerOptions,
     FitOptions,
     ImprintOptions,
@@ -24,7 +24,6 @@ from .options import (
     SolverOptions,
     StepOptions,
     VolumeOptions,
-    WriteOptions,
 )
 from .quantities import positive
 from .running import complain, reporting

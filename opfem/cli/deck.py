@@ -18,8 +18,9 @@ from ..model import Compression, Displacement, Imprint, Palpation
 from ..results import measured_thickness, summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, ExperimentSolution, Explicit, Newton, Solution, solve
 from ..solvers.progress import Progress
+from .deck_options import DeckOptions
 from .folder import DECK_PICTURE, prepare, record_failure, settle, write_result
-from .options import DeckOptions, RunOptions
+from .options import RunOptions
 from .statement import configure_jax
 
 INCREMENT = "axial_increment"

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from ..decks import write_inp
 from ..model import Contact, Experiment, LinearOverclosure, Palpation
-from .options import WriteOptions
+from .deck_options import WriteOptions
 
 Problem = TypeVar("Problem", Palpation, Experiment)
 

@@ -13,9 +13,10 @@ from ..model import Imprint
 from ..results import summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, Explicit, Newton, Solution, solve
 from ..solvers.progress import Progress
+from .deck_options import WriteOptions
 from .export import export, linear_settings, with_linear_contact
 from .folder import EXAMPLE, FINISHED, prepare, record_failure, settle, write_result
-from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions, WriteOptions
+from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
 

@@ -14,9 +14,10 @@ from ..model.plausible import check_approach
 from ..results import measured_thickness, summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, ExperimentSolution, Newton, solve
 from ..solvers.progress import Progress
+from .deck_options import WriteOptions
 from .export import export, with_linear_contact
 from .folder import FINISHED, SIMULATED, UNLOADED, prepare, record_failure, settle, write_result
-from .options import RunOptions, WriteOptions
+from .options import RunOptions
 from .scene import Scene, in_keys, read_scene
 from .statement import configure_jax
 

@@ -57,11 +57,13 @@ class Body:
 
     def face_nodes(self, faces: tuple[Face, ...]) -> np.ndarray:
         """Find the quadrilaterals of a surface that are this body's `(k, 4)`."""
-        if self.corners is None:
-            raise self.place.refuse(f"contact of {self.name}, of {', '.join(self.kinds)}, is not supported.")
         found = [np.zeros((0, 4), np.int64)]
         for members, side in faces:
             chosen = np.isin(self.elements, members.get(self.instance, ()))
+            if not chosen.any():
+                continue
+            if self.corners is None:
+                raise self.place.refuse(f"contact of {self.name}, of {', '.join(self.kinds)}, is not supported.")
             found.append(self.corners[chosen][:, FACES[side - 1]])
         return np.concatenate(found)
 

@@ -26,9 +26,9 @@ def find_problem(deck: Deck, layer: str | None = None) -> Problem:
     start = Place(deck.name, 1)
     if not deck.steps:
         raise start.refuse("the deck has no *STEP, so that nothing is loaded.")
-    for step in deck.steps:
-        if not step.is_nonlinear and deck.code == "abaqus":
-            raise step.place.refuse("*STEP without NLGEOM is linear; opfem solves large strain. Say NLGEOM=YES.")
+    if deck.code == "abaqus" and not deck.steps[0].is_nonlinear:  # it then holds for later steps, too
+        place = deck.steps[0].place
+        raise place.refuse("*STEP without NLGEOM is linear; opfem solves large strain. Say NLGEOM=YES.")
     bodies = find_bodies(deck)
     soft = [body for body in bodies if is_soft(body, deck)]
     if len(soft) not in (1, 2):

@@ -17,7 +17,7 @@ def displacements(body: Body, deck: Deck) -> np.ndarray:
     """
     held = np.full((len(body.numbers), 3), np.nan)
     for condition in deck.prescribed:
-        _apply(condition, body, held, _factor_static(condition, deck, 0.0))
+        _apply(condition, body, held, _factor(condition, deck, 0.0))
     ends, before = [], 0.0
     for step in deck.steps:
         begin = held.copy()
@@ -25,7 +25,7 @@ def displacements(body: Body, deck: Deck) -> np.ndarray:
             held = np.full_like(held, np.nan)
         for condition in step.prescribed:
             if step.kind == "static":
-                _apply(condition, body, held, _factor_static(condition, deck, before + step.time, step.time))
+                _apply(condition, body, held, _factor(condition, deck, before + step.time, step.time))
             else:
                 change = np.full_like(held, np.nan)
                 _apply(condition, body, change, _change(condition, deck, before, step))
@@ -41,10 +41,7 @@ def forces(body: Body, deck: Deck) -> np.ndarray:
     ends, acting, before = [], np.zeros((len(body.numbers), 3)), 0.0
     for step in deck.steps:
         for condition in step.forces:
-            change = np.full_like(acting, np.nan)
-            before_end = _factor_static(condition, deck, before + step.time, step.time)
-            _apply(condition, body, change, before_end)
-            acting = np.where(np.isnan(change), acting, change)
+            _apply(condition, body, acting, _factor(condition, deck, before + step.time, step.time))
         before += step.time
         ends.append(acting.copy())
     return np.array(ends).reshape(len(deck.steps), *acting.shape)
@@ -58,7 +55,7 @@ def _apply(condition: Condition, body: Body, held: np.ndarray, factor: float) ->
     held[at[own], condition.component] = factor * condition.values[own]
 
 
-def _factor_static(condition: Condition, deck: Deck, total: float, time: float | None = None) -> float:
+def _factor(condition: Condition, deck: Deck, total: float, time: float | None = None) -> float:
     if not condition.amplitude:
         return 1.0
     amplitude = deck.amplitudes[condition.amplitude]

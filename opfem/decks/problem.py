@@ -118,11 +118,11 @@ class Problem:
                 f"{self.layer.body.name}, the layer, has {len(materials)} materials; opfem's layer has one."
             )
         law = law_of(self.deck.materials[materials.pop()], self.deck, element, bulk)
-        layer = Layer(_map(self.heights[-1], self.extent, self.size), law)
         nx, ny, nz = self.layer.counts
-        window = self._side(self.window, is_window=True)
+        window = self._side(self.window)
         hold = self._hold(held, law)
         try:
+            layer = Layer(_map(self.heights[-1], self.extent, self.size), law)
             if self.sample is None:
                 return Palpation(
                     layer, self.extent, (nx, ny, nz), window, self._side(self.top), held.sides, element, hold
@@ -133,7 +133,7 @@ class Problem:
         except ValueError as cause:
             raise self.layer.body.place.refuse(str(cause)) from None
 
-    def _side(self, end: Surface | Held, is_window: bool = False) -> Side:
+    def _side(self, end: Surface | Held) -> Side:
         if isinstance(end, Surface):
             if not self._covers(end):
                 raise end.place.refuse(f"*CONTACT PAIR: {end.body.name} is smaller than the layer; it must cover it.")
@@ -150,13 +150,11 @@ class Problem:
         )
 
     def _hold(self, held: Supports, law: AbstractMaterial) -> float | None:
-        """Take springs to ground as they are, but none that only help a solver beside pinned nodes."""
-        return None if not held.hold or self._is_help(held, law) else held.hold
-
-    def _is_help(self, held: Supports, law: AbstractMaterial) -> bool:
+        """Take springs to ground [N/mm] as they are, but none that only help a solver beside pinned nodes."""
         lx, ly = self.extent
         stiffness = float(law.shear) * lx * ly / float(self.heights[-1].mean())
-        return held.pins > 0 and held.hold < _WEAK * stiffness
+        is_help = held.pins > 0 and held.hold < _WEAK * stiffness
+        return None if not held.hold or is_help else held.hold
 
     def _with_sample(
         self, layer: Layer, window: Side, held: Supports, element: str, bulk: float | None, hold: float | None
@@ -314,9 +312,9 @@ class Problem:
         if self.sample is not None or not isinstance(self.top, Surface):
             return []
         clearance = float(contact_of(self.top.interaction, self.deck).law.zero_pressure_clearance)
-        columns = np.interp(self.layer.x, self.top.plane.x, self.top.rest[0])
-        gap = self.sign * (columns - self.layer.z[-1]) if is_flat(self.top.rest, self.size) else np.array(clearance)
-        off = float(np.abs(gap - clearance).max())
+        if not is_flat(self.top.rest, self.size):
+            return []
+        off = float(np.abs(self.sign * (self.top.rest[0, 0] - self.layer.z[-1]) - clearance).max())
         if off <= SAME * self.size:
             return []
         return [f"{self.top.body.name} starts {off:.3g} mm from where its contact law does; only its end counts here"]

@@ -191,7 +191,7 @@ STEPS = {
     "BULK VISCOSITY": Keyword(_bulk_viscosity, within="a step"),
     "FIXED MASS SCALING": Keyword(_mass_scaling, ("FACTOR",), within="a step"),
     "BOUNDARY": Keyword(_boundary, ("AMPLITUDE", "OP", "TYPE"), within="anywhere"),
-    "CLOAD": Keyword(_force, ("AMPLITUDE", "OP"), within="a step"),
+    "CLOAD": Keyword(_force, ("AMPLITUDE",), within="a step"),
     "OUTPUT": Keyword(_output, _OUTPUT, within="a step"),
     **dict.fromkeys(_REQUESTS, _REQUEST),
 }

@@ -133,6 +133,8 @@ def test_explicit_steps_add_up_and_static_ones_replace(read):
     static = [line for line in imprint_deck(uz=-0.05, steps=2) if line != ", 1." and "Viscosity" not in line]
     static = [line for line in static if line != "0.06, 1.2" and "Mass Scaling" not in line]
     static = [line.replace("*Dynamic, Explicit", "*Static").replace(", amplitude=Amp", "") for line in static]
+    linear = read([line.replace("nlgeom=YES", "nlgeom=NO") for line in static])
+    assert "*STEP without NLGEOM is linear; opfem solves large strain" in refusal(linear.loads)
     deck = read(static)
     with pytest.raises(op.DeckError, match=r"has D = 0, which Abaqus/Standard takes in hybrid elements only"):
         deck.experiment()
