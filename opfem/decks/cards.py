@@ -5,6 +5,7 @@ Knows the format and no keyword's meaning; numbers are read in one go, line by l
 
 import gzip
 import re
+import warnings
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import numpy as np
 # Text of all files together; numbers and text of that much take 1.5 GB, of 50 MB some 0.2 GB.
 MAX_BYTES = 512 * 2**20
 _LARGEST = 1e15  # label that a float64 holds exactly
+_LONGEST = 10_000  # letters of a keyword with its options
 _DEEPEST = 16  # files included by included files
 _KEYWORD = re.compile(rb"^[ \t]*\*(?!\*)[^\n]*", re.MULTILINE)
 _NO_DATA = re.compile(rb"^[ \t]*(?:\*\*[^\n]*)?(?:\n|\Z)", re.MULTILINE)
@@ -172,8 +174,6 @@ def _member(word: str) -> np.ndarray | str:
 
 def _quick_numbers(content: bytes) -> np.ndarray | None:
     """Read numbers with commas between them; None where that is not all there is."""
-    import warnings
-
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -264,6 +264,12 @@ class _Files:
             while whole[match.start() : end].rstrip().endswith(b",") and end < len(whole):
                 found = whole.find(b"\n", end + 1)
                 end = len(whole) if found < 0 else found
+                if end - match.start() > _LONGEST:
+                    break
+            if end - match.start() > _LONGEST:
+                raise place.refuse(
+                    f"a keyword of more than {_LONGEST} letters; does a comma at its end join what follows?"
+                )
             card = _card(whole[match.start() : end].decode("latin-1"), place)
             line += whole.count(b"\n", match.start(), end + 1)
             at = end + 1

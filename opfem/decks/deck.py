@@ -217,7 +217,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Deck:
-    """What an Abaqus or CalculiX input file says, made by `read_inp`.
+    """What an Abaqus or CalculiX input file says, made by `read_inp` and not changed any more.
 
     Names are in capitals, as both codes take them; units are the deck's, for opfem mm, N, MPa, s, tonne.
 

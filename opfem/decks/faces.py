@@ -154,7 +154,8 @@ def supports(block: Block, deck: Deck) -> Supports:
     ends = {}
     for side in (0, -1):
         face = mask[side]
-        lateral, normal = face[..., :2].all(), face[..., 2].all()
+        normal = face[..., 2].all()
+        lateral = normal and face[..., :2].all()
         if lateral:
             explained[side, ..., :2] = True
         if normal:

@@ -55,15 +55,22 @@ def _of_one(deck: Deck, block: Block, surfaces: dict[int, Surface]) -> Problem:
         return is_flat(heights, size) and float(np.ptp(heights)) <= SAME * size
 
     found = supports(block, deck)
+    low, high = _end(surfaces.get(0), found.low), _end(surfaces.get(-1), found.high)
     if can_be_window(0, found.low):
-        return Problem(deck, block, None, False, surfaces.get(0, found.low), None, surfaces.get(-1, found.high))
+        return Problem(deck, block, None, False, low, None, high)
     if can_be_window(-1, found.high):
-        ends = surfaces.get(-1, found.high), surfaces.get(0, found.low)
-        return Problem(deck, block.flipped(), None, True, ends[0], None, ends[1])
+        return Problem(deck, block.flipped(), None, True, high, None, low)
     raise block.body.place.refuse(
         f"neither the lower nor the upper face of {block.body.name} has a window: a plane at rest, in contact or held. "
         + HINT
     )
+
+
+def _end(surface: Surface | None, held: Held) -> Surface | Held:
+    """Take what a face is in contact with, or how its nodes are held; not both."""
+    if surface is not None and held.uz is not None:
+        raise surface.place.refuse("*CONTACT PAIR: nodes of a face in contact are held along z besides.")
+    return held if surface is None else surface
 
 
 def _of_two(deck: Deck, blocks: list[Block], at: dict[tuple[int, int], Touching], layer: str | None) -> Problem:
@@ -87,7 +94,10 @@ def _of_two(deck: Deck, blocks: list[Block], at: dict[tuple[int, int], Touching]
         found = at.get((number, side))
         if found is not None and found.other in (lower.body, upper.body):
             raise found.pair.place.refuse("*CONTACT PAIR: layer and sample touch at one face only.")
-        ends.append(rigid_surface(found, deck) if found is not None else held.low if side == 0 else held.high)
+        surface = None if found is None else rigid_surface(found, deck)
+        ends.append(_end(surface, held.low if side == 0 else held.high))
+        if (held.high if side == 0 else held.low).uz is not None:
+            raise between.pair.place.refuse("*CONTACT PAIR: nodes of a face in contact are held along z besides.")
     contact = contact_of(deck.interactions[between.pair.interaction], deck)
     layer_block, sample_block = blocks[own], blocks[sample]
     if is_flipped:

@@ -369,8 +369,8 @@ class _Deck:
         often = "FREQUENCY=100000"  # the end of the step
         lines = [f"*NODE FILE, OUTPUT=3D, {often}", "U, RF", f"*EL FILE, {often}", "S"]
         lines += [f"*CONTACT FILE, {often}", "CDIS, CSTR"] if self.pairs else []
-        bodies = dict.fromkeys([*(body.name for body in self.rigid), moved.name, "LAYER"])
-        for name in bodies:
+        faces = ["LAYER_LOW", "LAYER_HIGH", *([f"{moved.name}_HIGH"] if moved.name == "SAMPLE" else [])]
+        for name in [*(body.name for body in self.rigid), *faces]:
             lines += [f"*NODE PRINT, NSET={name}, TOTALS=ONLY, {often}", "RF"]
         return [*lines, f"*EL PRINT, ELSET=LAYER_HIGH, {often}", "S"]
 

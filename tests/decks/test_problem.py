@@ -247,6 +247,12 @@ def test_sides_pins_and_springs(read):
     pinned = [*held[:at], "*Boundary", "Layer-1.Pin, 1, 2", *held[at:]]
     assert read(pinned).experiment().hold is None
     assert any("nodes held in the plane" in said for said in read(pinned).assumed())
+    for held_so, words in (("1, 2", "40 displacements of LAYER-1 are held"), ("3", "are held along z besides")):
+        bottom = ["*Nset, nset=Bottom, generate", "1, 20"]
+        at = lines.index("*Solid Section, elset=LayerAll, material=Rubber")
+        both = lines[:at] + bottom + lines[at:]
+        at = both.index("*Boundary")
+        assert words in refusal(read([*both[:at], "*Boundary", f"Layer-1.Bottom, {held_so}", *both[at:]]).experiment)
     at = lines.index("*Solid Section, elset=LayerAll, material=Rubber")
     assert float(read(lines[:at] + springs + lines[at:]).experiment().hold) == pytest.approx(0.02)
     wrong = [*held[:at], *held[at:]]

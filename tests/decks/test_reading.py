@@ -190,6 +190,12 @@ def test_no_deck_at_all(read, tmp_path):
         op.read_inp(tmp_path / "none.inp")
 
 
+def test_a_comma_too_many_joins_no_book(read):
+    lines = ["*Heading", "*Nset, nset=A,", *(["1, 2, 3,"] * 10_000)]
+    assert refused(read, lines).startswith("small.inp:2: a keyword of more than 10000 letters")
+    assert refused(read, ["*Heading", '*Node, nset="' + "a, " * 100_000]).startswith("small.inp:2: a keyword of more")
+
+
 def test_code_is_told_by_what_only_one_knows(read):
     assert read(EXPECTED, code="abaqus").code == "abaqus"
     with pytest.raises(op.DeckError, match='this is Abaqus\', but code="calculix" was passed'):
