@@ -8,6 +8,7 @@ that is stopped at the limit is reported as a bound.
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import re
@@ -15,7 +16,6 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,131 +28,8 @@ from benchmarks.stream import cores
 from tests.reference import cases
 
 CASES = ("coin_ccxcontact_top_mu0_bottom_slip_C3D8", "coin_ccxcontact_muwin0p15_mutop0p05_lam0p02_C3D8")
-# In-plane springs [N/mm] under the layer: without them a frictionless layer could drift without end.
-SPRING = 1e-7
 
-
-def deck(palpation: op.Palpation, load: op.Imprint) -> str:
-    """Write a palpation as a CalculiX deck: C3D8 layer, rigid imprint of flat facets, face-to-face contact.
-
-    Args:
-        palpation: A flat layer of `MooneyRivlin`; contact laws `LinearOverclosure`, the window perhaps a `Roller`.
-        load: The imprint.
-
-    Raises:
-        ValueError: If the palpation has something else.
-    """
-    return "\n".join([*_layer(palpation), *_imprint(palpation, load), *_window(palpation), *_steps(palpation, load)])
-
-
-def _layer(palpation: op.Palpation) -> Iterator[str]:
-    nx, ny, nz = palpation.elements
-    material = palpation.layer.material
-    if not isinstance(material, op.MooneyRivlin) or set(palpation.sides) != {"free"}:
-        raise ValueError("A deck needs a layer of MooneyRivlin with free sides.")
-    number = _layer_nodes(palpation)
-    X = np.asarray(palpation.mesh().positions())
-    yield "*NODE, NSET=NLAY"
-    yield from _rows(number.ravel(), X.reshape(3, -1).T)
-    low, high = number[:-1], number[1:]
-    corners = [
-        face[:, dy : dy + ny, dx : dx + nx] for face in (low, high) for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1))
-    ]
-    yield "*ELEMENT, TYPE=C3D8, ELSET=ELAY"
-    elements = np.arange(1, nx * ny * nz + 1)
-    yield from _rows(elements, np.stack(corners).reshape(8, -1).T)
-    yield "*ELSET, ELSET=ETOP"
-    yield from _rows(elements[-nx * ny :])
-    yield "*NSET, NSET=NBOT"
-    yield from _rows(number[0].ravel())
-    yield from ("*SURFACE, NAME=STOP", "ETOP, S2", "*SURFACE, NAME=SBOT")
-    yield from (f"{element}, S1" for element in elements[: nx * ny])
-    yield from ("*MATERIAL, NAME=LAYER", "*HYPERELASTIC, MOONEY-RIVLIN")
-    yield f"{material.c10}, {material.c01}, {2.0 / material.bulk:.12g}"
-    yield from ("*SOLID SECTION, ELSET=ELAY, MATERIAL=LAYER", "*MATERIAL, NAME=RIGID", "*ELASTIC", "1., 0.")
-    for direction in (1, 2):
-        springs = nx * ny * nz + (direction - 1) * number[0].size + number[0].ravel()
-        yield f"*ELEMENT, TYPE=SPRING1, ELSET=ESPRING{direction}"
-        yield from _rows(springs, number[0].reshape(-1, 1))
-        yield from (f"*SPRING, ELSET=ESPRING{direction}", str(direction), f"{SPRING:.6E}")
-
-
-def _layer_nodes(palpation: op.Palpation) -> np.ndarray:
-    nx, ny, nz = palpation.elements
-    return 1 + np.arange((nz + 1) * (ny + 1) * (nx + 1)).reshape(nz + 1, ny + 1, nx + 1)
-
-
-def _rigid_number(palpation: op.Palpation) -> int:
-    """First number of nodes and elements of the rigid bodies: beyond the layer's. CalculiX's memory grows with it."""
-    nx, ny, nz = palpation.elements
-    return (nx + 1) * (ny + 1) * (nz + 3) + 1
-
-
-def _imprint(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
-    thickness = load.thickness
-    y, x = (coordinates.ravel() for coordinates in np.meshgrid(thickness.y, thickness.x, indexing="ij"))
-    z = np.full(x.size, float(palpation.layer.thickness))
-    first = _rigid_number(palpation) + 8  # after the window's
-    nodes = first + np.arange(2 * x.size)
-    yield "*NODE, NSET=NIMP"
-    yield from _rows(nodes, np.stack([np.tile(x, 2), np.tile(y, 2), np.concatenate([z, z + 0.5])], axis=1))
-    low, high = nodes.reshape(2, *thickness.values.shape)
-    around = (
-        (slice(-1), slice(-1)),
-        (slice(-1), slice(1, None)),
-        (slice(1, None), slice(1, None)),
-        (slice(1, None), slice(-1)),
-    )
-    corners = np.stack([face[at].ravel() for face in (low, high) for at in around], axis=1)
-    yield "*ELEMENT, TYPE=C3D8, ELSET=EIMP"
-    yield from _rows(first + np.arange(len(corners)), corners)
-    yield from ("*SOLID SECTION, ELSET=EIMP, MATERIAL=RIGID", "*SURFACE, NAME=SIMP", "EIMP, S1")
-    yield from _contact(palpation.sample, "TOP", "STOP, SIMP")
-
-
-def _window(palpation: op.Palpation) -> Iterator[str]:
-    if isinstance(palpation.window, op.Roller):
-        return
-    first = _rigid_number(palpation)
-    width, depth = np.asarray(palpation.extent)
-    ends = [(-width, -depth), (2 * width, -depth), (2 * width, 2 * depth), (-width, 2 * depth)]
-    yield "*NODE, NSET=NWIN"
-    yield from _rows(first + np.arange(8), np.array([(*end, z) for z in (-1.0, 0.0) for end in ends]))
-    yield "*ELEMENT, TYPE=C3D8, ELSET=EWIN"
-    yield from _rows([first], first + np.arange(8)[None])
-    yield from ("*SOLID SECTION, ELSET=EWIN, MATERIAL=RIGID", "*SURFACE, NAME=SWIN", f"{first}, S2")
-    yield from _contact(palpation.window, "BOTTOM", "SBOT, SWIN")
-
-
-def _contact(side: op.Contact, name: str, pair: str) -> Iterator[str]:
-    if not isinstance(side, op.Contact) or not isinstance(side.law, op.LinearOverclosure):
-        raise ValueError(f"A deck needs Contact(LinearOverclosure(...)) there, got {side!r}.")
-    yield f"*SURFACE INTERACTION, NAME=I{name}"
-    yield from ("*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR", f"{side.law.stiffness}, 1e-05, 0.001")
-    if side.friction > 0:
-        yield from ("*FRICTION", f"{side.friction}, {side.stick_slope}")
-    yield from (f"*CONTACT PAIR, INTERACTION=I{name}, TYPE=SURFACE TO SURFACE", pair)
-
-
-def _steps(palpation: op.Palpation, load: op.Imprint) -> Iterator[str]:
-    uz = np.tile(np.asarray(load.thickness.values - palpation.layer.thickness).ravel(), 2)
-    yield from ("*BOUNDARY", "NIMP, 1, 2")
-    if isinstance(palpation.window, op.Roller):
-        yield "NBOT, 3, 3"
-    else:  # friction holds the layer; two nodes in its middle keep it from drifting before it does
-        nx, ny, _ = palpation.elements
-        middle = _layer_nodes(palpation)[0, ny // 2]
-        yield from ("NWIN, 1, 3", f"{middle[nx // 2]}, 1, 2", f"{middle[nx // 2 + max(nx // 20, 1)]}, 2, 2")
-    yield from ("*STEP, NLGEOM, INC=400", "*STATIC", "0.1, 1., 1e-5, 0.15", "*BOUNDARY")
-    first = _rigid_number(palpation) + 8
-    yield from (f"{first + node}, 3, 3, {value:.9g}" for node, value in enumerate(uz))
-    yield from ("*NODE PRINT, NSET=NIMP, TOTALS=ONLY, FREQUENCY=100000", "RF")
-    yield from ("*EL PRINT, ELSET=ETOP, FREQUENCY=100000", "S", "*END STEP", "")
-
-
-def _rows(numbers: Iterable, values: np.ndarray | None = None) -> Iterator[str]:
-    for k, number in enumerate(numbers):
-        yield f"{number}," if values is None else ", ".join([str(number), *(f"{value:.9g}" for value in values[k])])
+SPRING = 1e-7  # N/mm in the plane under each node of a layer without friction, as in the stored cases
 
 
 @dataclass(frozen=True)
@@ -167,16 +44,16 @@ class Run:
     stress: np.ndarray  # mean S33 of the top elements [MPa], NaN without
 
 
-def run_calculix(text: str, shape: tuple[int, int], limit: float) -> Run:
-    """Solve a deck with ccx, on all cores unless OMP_NUM_THREADS says otherwise.
+def run_calculix(palpation: op.Palpation, load: op.Imprint, limit: float) -> Run:
+    """Solve a palpation with ccx, on all cores unless OMP_NUM_THREADS says otherwise.
 
     Args:
-        text: The deck.
-        shape: Top elements (ny, nx).
+        palpation: The palpation.
+        load: Its load.
         limit: Wall time [s] after which it is stopped.
     """
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "job.inp").write_text(text)
+        op.write_inp(Path(folder) / "job.inp", palpation, load, op.Newton(increments=10), code="calculix")
         environment = {"OMP_NUM_THREADS": str(cores())} | os.environ
         begin = time.perf_counter()
         process = subprocess.Popen(["ccx", "-i", "job"], cwd=folder, env=environment, stdout=subprocess.DEVNULL)
@@ -189,7 +66,7 @@ def run_calculix(text: str, shape: tuple[int, int], limit: float) -> Run:
         finally:
             process.kill()
         status = process.wait()
-        force, stress = read_results(Path(folder) / "job.dat", shape)
+        force, stress = read_results(Path(folder) / "job.dat", palpation)
         return Run(
             finished=status == 0 and bool(np.isfinite(force)),
             seconds=seconds,
@@ -210,19 +87,13 @@ def peak_memory(process: int) -> float:
     return int(peak.group(1)) / 1024 if peak else 0.0
 
 
-def read_results(path: Path, shape: tuple[int, int]) -> tuple[float, np.ndarray]:
+def read_results(path: Path, palpation: op.Palpation) -> tuple[float, np.ndarray]:
     """Read the imprint's force [N] and the mean S33 [MPa] of the top elements at the end of the step."""
-    text = path.read_text() if path.exists() else ""
-    nothing = np.full(shape, np.nan)
-    total = re.findall(r"total force \(fx,fy,fz\) for set NIMP and time\s+1\.0+E\+00\s+(\S+)\s+(\S+)\s+(\S+)", text)
-    total += re.findall(r"total force \(fx,fy,fz\) for set NIMP and time\s+0?\.10+E\+01\s+(\S+)\s+(\S+)\s+(\S+)", text)
-    if not total:
-        return np.nan, nothing
-    table = text[text.rindex("stresses (elem") :].split("\n\n")[1]
-    values = np.array([line.split() for line in table.strip().splitlines()], float)
-    elements, where = np.unique(values[:, 0], return_inverse=True)
-    mean = np.bincount(where, values[:, 4]) / np.bincount(where)
-    return -float(total[-1][2]), mean.reshape(shape) if elements.size == nothing.size else nothing
+    try:
+        data = op.read_dat(path, palpation).isel(time=-1)
+    except (OSError, op.DeckError):
+        return np.nan, np.full(palpation.elements[1::-1], np.nan)
+    return -float(data.force_press.sel(component="z")), data.stress_zz.values
 
 
 def count_iterations(path: Path) -> int:
@@ -248,7 +119,10 @@ def measure(shared: Path, name: str, n: int, limit: float, with_opfem: bool) -> 
     palpation, load = contact_on_mesh(shared, name, n, "full")
     row = {"case": name, "elements": palpation.elements}
     surface = cases.imprint_map(cases.load_case(shared, name)[0])  # not moved, as opfem's is where the layer drifts
-    run = run_calculix(deck(palpation, op.Imprint(surface)), palpation.elements[1::-1], limit)
+    held = palpation
+    if isinstance(palpation.window, op.Roller):  # nothing holds the layer in the plane
+        held = dataclasses.replace(palpation, hold=SPRING * (n + 1) ** 2)
+    run = run_calculix(held, op.Imprint(surface), limit)
     row |= {
         "calculix_finished": run.finished,
         "calculix_seconds": round(run.seconds, 1),

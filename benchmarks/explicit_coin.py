@@ -11,6 +11,7 @@ Displacements of the deck's second step are taken as moves from where the first 
 """
 
 import argparse
+import dataclasses
 import json
 import resource
 import time
@@ -21,66 +22,36 @@ import numpy as np
 
 import opfem as op
 
-from .friction_decks import K_OVER_MU, keywords
-
 NODES = 57  # of the imprint along a side, 0.125 mm apart, from -1 to 6 mm
-L0 = 0.5  # mm
 OPFEM = "catmull-rom"  # interpolation
 
 
-def imprint_steps(path: Path) -> list[np.ndarray]:
-    """Read the imprint's u_z [mm] of every step of a deck, `(57, 57)`, and what it is fixed by."""
-    steps = []
-    for keyword in keywords(path):
-        moves = [row for row in keyword.rows if "impAssembly." in row[0] and row[0].split(".")[-1].isdigit()]
-        if keyword.name == "BOUNDARY" and moves:
-            values = np.array([float(row[3]) for row in moves])
-            steps.append(values[: NODES**2].reshape(NODES, NODES))
-    return steps
-
-
-def material(path: Path) -> op.MooneyRivlin:
-    """Read the layer's material of a deck."""
-    c10, c01, _ = next(keyword.numbers() for keyword in keywords(path) if keyword.name == "HYPERELASTIC")
-    return op.MooneyRivlin(c10, c01, bulk=K_OVER_MU * 2.0 * (c10 + c01))
-
-
-def experiment(path: Path, frictionless: bool) -> op.Palpation:
-    """State a deck."""
-    frictions = [keyword.numbers()[0] for keyword in keywords(path) if keyword.name == "FRICTION"]
-    sample, window = (0.0, 0.0) if frictionless else frictions
-    return op.Palpation(
-        op.Layer(L0, material(path)),
-        extent=(5.0, 5.0),
-        elements=(40, 40, 4),
-        window=op.Contact(op.HardOverclosure(), window),
-        sample=op.Contact(op.ExponentialOverclosure(pressure=2.0, clearance=0.01), sample),
+def with_friction(palpation: op.Palpation, frictions: tuple[float, float]) -> op.Palpation:
+    """Replace the friction of window and sample."""
+    window, sample = (
+        op.Contact(side.law, friction)
+        for side, friction in zip((palpation.window, palpation.sample), frictions, strict=True)
     )
-
-
-def surface(uz: np.ndarray, interpolation: str) -> op.Imprint:
-    """State the rigid surface."""
-    loaded = op.ThicknessMap(L0 + uz, extent=(7.0, 7.0), origin=(-1.0, -1.0))
-    return op.Imprint(loaded, interpolation=interpolation)
+    return dataclasses.replace(palpation, window=window, sample=sample)
 
 
 def cases(shared: Path, name: str) -> tuple[op.Palpation, list[op.Imprint], float]:
     """State a case: the experiment, its steps, and the deck's mass scaling."""
-    decks = shared / "data" / "decks"
-    coin = decks / "fQOCE_validate_coin_t1_125um.inp.gz"
-    if name == "sin":
-        deck = decks / "fQOCE_sol_sin_t2.inp.gz"
-        first, second = imprint_steps(deck)
-        return experiment(deck, False), [surface(first, OPFEM), surface(first + second, OPFEM)], 5.0
-    if name in ("sharp", "facets"):
-        interpolation = "bilinear" if name == "facets" else OPFEM
-        return experiment(coin, False), [surface(uz, interpolation) for uz in imprint_steps(coin)], 25.0
+    name_of_deck = "sol_sin_t2" if name == "sin" else "validate_coin_t1_125um"
+    deck = op.read_inp(shared / "data" / "decks" / f"fQOCE_{name_of_deck}.inp.gz")
+    palpation = deck.experiment()
+    scaling = deck.solver().mass_scaling
+    if not name.startswith("smooth"):
+        return palpation, list(deck.loads("bilinear" if name == "facets" else OPFEM)), scaling
     stored = shared / "reference" / "ccx" / "cases" / "smoothcoin_muwin0p15_mutop0p05_C3D8.npz"
     with np.load(stored) as case:
         nodes, values = case["imprint_nodes"][: NODES**2], case["imprint_uz"][: NODES**2]
     uz = np.zeros((NODES, NODES))
     uz[tuple(np.rint((nodes[:, k] + 1.0) / 0.125).astype(int) for k in (1, 0))] = values
-    return experiment(coin, name == "smooth-frictionless"), [surface(uz, "cubic")], 25.0
+    loaded = op.ThicknessMap(palpation.layer.thickness + uz, extent=(7.0, 7.0), origin=(-1.0, -1.0))
+    if name == "smooth-frictionless":
+        palpation = with_friction(palpation, (0.0, 0.0))
+    return palpation, [op.Imprint(loaded)], scaling
 
 
 def relative(values, reference) -> float:

@@ -2,6 +2,14 @@
 
 from . import datasets as datasets
 from .compilation import cache_compilation as cache_compilation
+from .decks import (
+    Deck as Deck,
+    DeckError as DeckError,
+    read_dat as read_dat,
+    read_frd as read_frd,
+    read_inp as read_inp,
+    write_inp as write_inp,
+)
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
     FitError as FitError,

@@ -25,12 +25,13 @@ MAY_IMPORT |= {
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},
     "datasets": {"datasets", "io", "measurement"},
+    "decks": {"decks", "io", *CHAIN},
     "sweeps": {"sweeps", "io", "compilation", *CHAIN},
 }
 SEE_ALL = {"__init__", "__main__", "cli"}
 
 LIBRARY_HOMES = {
-    "xarray": {"results", "io", "sweeps", "plot", "cli"},
+    "xarray": {"results", "io", "decks", "sweeps", "plot", "cli"},
     "h5py": {"io"},
     "scipy.io": {"io"},
     "tifffile": {"io"},

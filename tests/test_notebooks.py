@@ -10,6 +10,12 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 # What each prints, as patterns.
 PRINTED = {
+    "decks": [
+        r"2 steps; force 0\.\d+ N, then 0\.\d+ N",
+        r"phase from -\d\d\.\d to -?\d+\.\d rad",
+        r"CalculiX has no element|CalculiX cannot say",
+        r"round trip: equal for calculix",
+    ],
     "explicit": [
         r"explicit: force 0\.\d+ N",
         r"pressure inside: difference 0\.\d\d%",

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .deck_options import DeckOptions, WriteOptions
 from .messages import say
 from .options import (
     ContactOptions,
@@ -79,6 +80,7 @@ def palpate(
     layer: LayerOptions = LayerOptions(),
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
+    deck: WriteOptions = WriteOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
@@ -88,7 +90,7 @@ def palpate(
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, run)
+        palpate(map, out, reading, layer, contact, solver, deck, run)
 
 
 @app.command
@@ -149,6 +151,7 @@ def simulate(
     /,
     *,
     out: _Out,
+    deck: WriteOptions = WriteOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
@@ -159,7 +162,35 @@ def simulate(
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, run)
+        simulate(scene, out, deck, run)
+
+
+@app.command
+def deck(
+    file: Annotated[Path, Parameter(name="FILE", help="Abaqus or CalculiX input file (.inp, .inp.gz).")],
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder of the results; needed unless --info.")] = None,
+    info: Annotated[
+        bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
+    ] = False,
+    asked: DeckOptions = DeckOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Solve an Abaqus or CalculiX deck: a soft layer between rigid bodies, or under a soft sample; step by step.
+
+    Writes result.nc, result.vtu, summary.json and pictures of the last step, those of earlier ones in step_1 and so on.
+    From the second step on, result.nc holds axial_increment, what a phase-sensitive OCT sees between two steps.
+    """
+    from .deck import solve_deck, state_deck
+
+    with reporting(run.debug):
+        if info:
+            state_deck(file, out, asked, run)
+        elif out is None:
+            raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
+        else:
+            solve_deck(file, out, asked, run)
 
 
 @app.command

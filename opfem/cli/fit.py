@@ -55,7 +55,7 @@ def fit(
         prior = state_prior(palpation, filled, asked)
         settings = {**settings_of(map, reading, layer, contact, filled), **_asked(asked, prior)}
         prepare(out)
-        show_assumptions(palpation, measured, layer, contact)
+        show_assumptions(palpation, measured, layer)
         Console(highlight=False).print(
             f"  prior: pressure {1e3 * settings['prior_mean']:.3g} ± {1e3 * settings['prior_std']:.3g} kPa, "
             f"correlated over {settings['prior_length']:.3g} mm; noise of the map as given"

@@ -21,7 +21,8 @@ from ..sweeps.store import PLAN
 FINISHED = "result.nc"
 EXAMPLE = "example_map.npz"
 SIMULATED, UNLOADED = "map.npz", "l0.npz"
-_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png")
+DECK_PICTURE = "deck.png"
+_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png", DECK_PICTURE)
 # All that `palpate`, `fit` and `simulate` write.
 RESULT = (EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_PICTURES, "summary.json", FINISHED)
 

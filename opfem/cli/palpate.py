@@ -13,6 +13,8 @@ from ..model import Imprint
 from ..results import summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, Explicit, Newton, Solution, solve
 from ..solvers.progress import Progress
+from .deck_options import WriteOptions
+from .export import export, linear_settings, with_linear_contact
 from .folder import EXAMPLE, FINISHED, prepare, record_failure, settle, write_result
 from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
@@ -25,6 +27,7 @@ def palpate(
     layer: LayerOptions,
     contact: ImprintOptions,
     solver: SolverOptions,
+    deck: WriteOptions,
     run: RunOptions,
 ) -> None:
     """Solve for the stress map of a measured thickness map and write it.
@@ -36,6 +39,7 @@ def palpate(
         layer: The layer and its mesh.
         contact: Contact with window and sample.
         solver: The solver.
+        deck: A deck of the problem, to write too.
         run: The run itself.
     """
     with Progress(True, at_once=True) as progress:
@@ -44,11 +48,13 @@ def palpate(
         settle(out, run.force)
         measured, unloaded = read_maps(map, reading)
         palpation, thickness = state_experiment(measured, unloaded, reading, layer, contact)
+        palpation = with_linear_contact(palpation, deck)
         load = Imprint(thickness, correct_approach=contact.correct_approach)
-        settings = settings_of(map, reading, layer, contact, thickness)
+        settings = settings_of(map, reading, layer, contact, thickness) | linear_settings(deck)
         chosen = _solver(solver)
         prepare(out)
-        show_assumptions(palpation, thickness, layer, contact)
+        show_assumptions(palpation, thickness, layer)
+        export(palpation, load, chosen, deck)
         try:
             solution = solve(palpation, load, chosen)
         except ConvergenceError as failure:
@@ -70,7 +76,7 @@ def demo(out: Path, coin: bool, solver: SolverOptions, run: RunOptions) -> None:
     """
     map = str(coin_file()) if coin else "example"
     reading = MapOptions(l0=str(COIN_LAYER), extent=(5.0, 5.0)) if coin else MapOptions()
-    palpate(map, out, reading, LayerOptions(), ImprintOptions(), solver, run)
+    palpate(map, out, reading, LayerOptions(), ImprintOptions(), solver, WriteOptions(), run)
 
 
 def write_results(

@@ -14,18 +14,21 @@ from ..model.plausible import check_approach
 from ..results import measured_thickness, summary, summary_rows, to_xarray
 from ..solvers import ConvergenceError, ExperimentSolution, Newton, solve
 from ..solvers.progress import Progress
+from .deck_options import WriteOptions
+from .export import export, with_linear_contact
 from .folder import FINISHED, SIMULATED, UNLOADED, prepare, record_failure, settle, write_result
 from .options import RunOptions
 from .scene import Scene, in_keys, read_scene
 from .statement import configure_jax
 
 
-def simulate(config: Path, out: Path, run: RunOptions) -> None:
+def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> None:
     """Solve the experiment of a scene, measure it, and write map, truth and pictures.
 
     Args:
         config: The scene.
         out: Folder of the results.
+        deck: A deck of the problem, to write too.
         run: The run itself.
     """
     with Progress(True, at_once=True) as progress:
@@ -33,14 +36,16 @@ def simulate(config: Path, out: Path, run: RunOptions) -> None:
         configure_jax(run.no_cache)
         settle(out, run.force)
         scene = read_scene(config)
+        scene = scene._replace(experiment=with_linear_contact(scene.experiment, deck))
         try:
             check_approach(scene.load.approach, scene.experiment.plate_height)
         except ValueError as cause:
             raise ValueError(in_keys("[compression]", str(cause))) from None
         prepare(out)
         _show_experiment(scene)
+        solver = Newton() if scene.increments is None else Newton(increments=scene.increments)
+        export(scene.experiment, scene.load, solver, deck)
         try:
-            solver = Newton() if scene.increments is None else Newton(increments=scene.increments)
             truth = solve(scene.experiment, scene.load, solver)
         except ConvergenceError as failure:
             record_failure({**summary(failure.solution), "scene": scene.stated}, out)

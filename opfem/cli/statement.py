@@ -15,7 +15,16 @@ from .._types import ScalarLike
 from ..compilation import cache_compilation, silence_alarm
 from ..io import read_thickness
 from ..measurement import EXAMPLE_LAYER, MeasurementError, MeasurementWarning, ThicknessMap, example_map
-from ..model import Contact, ExponentialOverclosure, HardOverclosure, Layer, MooneyRivlin, Palpation
+from ..model import (
+    Contact,
+    ExponentialOverclosure,
+    HardOverclosure,
+    Layer,
+    LinearOverclosure,
+    MooneyRivlin,
+    Palpation,
+    Side,
+)
 from .messages import in_options
 from .options import (
     PUBLISHED_BULK,
@@ -181,16 +190,13 @@ def state_palpation(
     )
 
 
-def show_assumptions(
-    palpation: Palpation, thickness: ThicknessMap, layer: LayerOptions, contact: ContactOptions
-) -> None:
+def show_assumptions(palpation: Palpation, thickness: ThicknessMap, layer: LayerOptions) -> None:
     """Print what a run takes for granted.
 
     Args:
         palpation: The experiment.
         thickness: The loaded map as it is used.
         layer: Options of the layer.
-        contact: Options of contact.
     """
     material = _material(layer)
     missing = int(np.sum(thickness.mask))
@@ -208,9 +214,8 @@ def show_assumptions(
             if math.isinf(material.bulk)
             else f"bulk = {1e3 * material.bulk:g} kPa (K/µ = {material.bulk / material.shear:.3g})"
         ),
-        "window": f"hard contact, friction {contact.window_friction:g}",
-        "sample": f"exponential contact p0 = {contact.p0:g} MPa, c0 = {1e3 * contact.c0:g} µm, "
-        f"friction {contact.sample_friction:g}",
+        "window": _contact(palpation.window),
+        "sample": _contact(palpation.sample),
         "mesh": " × ".join(str(n) for n in palpation.elements) + f" {palpation.element} elements, sides {layer.sides}",
     }
     table = Table(box=None, show_header=False, padding=(0, 1))
@@ -220,6 +225,20 @@ def show_assumptions(
     console.print("Solving for the stress on the sample, with", table, sep="\n")
     if published:
         console.print(f"  Assumed: {', '.join(published)} of the published deck's layer. Is it yours?")
+
+
+def _contact(side: Side) -> str:
+    """Say in words what touches a face, and how."""
+    if not isinstance(side, Contact):
+        return type(side).__name__.lower()
+    match side.law:
+        case ExponentialOverclosure(pressure=p0, clearance=c0):
+            law = f"exponential contact p0 = {float(p0):g} MPa, c0 = {1e3 * float(c0):g} µm"
+        case LinearOverclosure(stiffness=stiffness):
+            law = f"linear contact of {float(stiffness):g} MPa/mm"
+        case _:
+            law = "hard contact"
+    return f"{law}, friction {float(side.friction):g}"
 
 
 def _ready(thickness: ThicknessMap, fwhm: float) -> ThicknessMap:

@@ -1,5 +1,6 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
+from .deck import draw_deck
 from .experiment import draw_simulation, plot_comparison, plot_section
 from .maps import (
     draw_fit,
@@ -16,6 +17,7 @@ from .oct import draw_interface, plot_interface
 from .scene import plot_layer
 
 __all__ = [
+    "draw_deck",
     "draw_fit",
     "draw_interface",
     "draw_pictures",

@@ -11,6 +11,7 @@ import pytest
 from opfem import cli
 from opfem.cli.commands import app
 from opfem.cli.messages import alike, in_options
+from tests.decks.texts import imprint_deck, text
 
 MAP = ("--l0", "0.5", "--extent", "2", "2")
 A_NUMBER = "must be a positive number"
@@ -84,8 +85,25 @@ FIT = [
     ("--draws", "many", "1", COUNT, "'many'"),
 ]
 APPROACH = [("--correct-approach=maybe", None, None, "must be given without a value", "'maybe'")]
+WRITE = [
+    ("--write-inp", "layer.txt", None, "must be a .inp file in a folder that exists", "'layer.txt'"),
+    ("--code", "ansys", None, "must be one of abaqus, calculix", "'ansys'"),
+    ("--contact-stiffness", "0", "MPa/mm", A_NUMBER, "0"),
+    ("--stick-slope", "-1", "MPa/mm", A_NUMBER, "-1"),
+]
+DECK = [
+    WRITE[1],
+    ("--bulk", "0", "MPa", A_NUMBER, "0"),
+    ("--layer", "skin", None, "the soft body is", "LAYER-1"),
+    ("--interpolation", "linear", None, "must be one of cubic, catmull-rom, bilinear", "'linear'"),
+    ("--solver", "abaqus", None, "must be one of deck, newton, explicit", "'abaqus'"),
+    *SOLVER[1:3],
+    ("--precision", "half", None, "must be one of float32, float64", "'half'"),
+    ("--info=maybe", None, None, "must be given without a value", "'maybe'"),
+]
 TABLE = {
-    "palpate": [*MAPS, *LAYER, *CONTACT, *APPROACH, *SOLVER, *FLAGS, *OUT],
+    "palpate": [*MAPS, *LAYER, *CONTACT, *APPROACH, *SOLVER, *WRITE, *FLAGS, *OUT],
+    "deck": [*DECK, *FLAGS, *OUT],
     "fit": [*MAPS, *LAYER, *CONTACT, *FIT, *SOLVER[1:3], *FLAGS, *OUT],
     "demo": [*SOLVER, *FLAGS, *OUT, ("--coin=maybe", None, None, "must be given without a value", "'maybe'")],
     "sweep": [*FLAGS, *OUT, ("--resume=maybe", None, None, "must be given without a value", "'maybe'")],
@@ -97,7 +115,7 @@ CONFIG = (
 
 
 # Refused once a file or folder was looked at, not by the option alone.
-LATE = ("--out", "--variable", "--l0-variable", "--missing")
+LATE = ("--out", "--variable", "--l0-variable", "--missing", "--layer")
 
 
 def accepted(*_, **__):
@@ -109,16 +127,17 @@ def run(tmp_path, monkeypatch, capsys):
     """Run a command on a good map, and return its status and what it said."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OPFEM_NO_CACHE", "1")
-    for name in ("palpate.solve", "fit.fit_traction", "sweep.compute"):
+    for name in ("palpate.solve", "deck.solve", "fit.fit_traction", "sweep.compute"):
         monkeypatch.setattr(f"opfem.cli.{name}", accepted)
     np.save("map.npy", np.full((17, 21), 0.45))
     (tmp_path / "a_file").write_text("")
     (tmp_path / "sweep.toml").write_text(CONFIG)
+    (tmp_path / "layer.inp").write_text(text(imprint_deck()))
 
     def run(command, *arguments):
-        subject = {"palpate": ["map.npy"], "fit": ["map.npy"], "sweep": ["sweep.toml"], "demo": []}[command]
+        files = {"palpate": ["map.npy"], "fit": ["map.npy"], "sweep": ["sweep.toml"], "deck": ["layer.inp"], "demo": []}
         with pytest.raises(SystemExit) as end:
-            cli.main([command, *subject, *arguments])
+            cli.main([command, *files[command], *arguments])
         return end.value.code, capsys.readouterr().err
 
     return run
