@@ -4,6 +4,7 @@ from . import datasets as datasets
 from .compilation import cache_compilation as cache_compilation
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
+    Calibration as Calibration,
     FitError as FitError,
     FitStatus as FitStatus,
     ForceReading as ForceReading,
@@ -14,6 +15,7 @@ from .inverse import (
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
     TractionFit as TractionFit,
+    calibrate as calibrate,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,
     mesh_error as mesh_error,
@@ -25,6 +27,7 @@ from .io import (
     read_netcdf as read_netcdf,
     read_oct as read_oct,
     read_spectra as read_spectra,
+    read_stress_strain as read_stress_strain,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
     write_oct as write_oct,
@@ -35,6 +38,7 @@ from .io import (
 from .measurement import (
     MeasurementError as MeasurementError,
     MeasurementWarning as MeasurementWarning,
+    StressStrain as StressStrain,
     ThicknessMap as ThicknessMap,
 )
 from .measurement.oct import (
@@ -79,6 +83,7 @@ from .model import (
     Yeoh as Yeoh,
 )
 from .plot import (
+    plot_calibration as plot_calibration,
     plot_comparison as plot_comparison,
     plot_fit as plot_fit,
     plot_interface as plot_interface,

@@ -1,5 +1,6 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
+from .calibration import draw_calibration, plot_calibration
 from .experiment import draw_simulation, plot_comparison, plot_section
 from .maps import (
     draw_fit,
@@ -16,10 +17,12 @@ from .oct import draw_interface, plot_interface
 from .scene import plot_layer
 
 __all__ = [
+    "draw_calibration",
     "draw_fit",
     "draw_interface",
     "draw_pictures",
     "draw_simulation",
+    "plot_calibration",
     "plot_comparison",
     "plot_fit",
     "plot_interface",
