@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .curve_options import CurveOptions, LawOptions
 from .messages import say
 from .options import (
     ContactOptions,
@@ -188,6 +189,26 @@ def oct(
 
     with reporting(run.debug):
         measure(loaded, out, unloaded, l0, reading, microscope, asked, run)
+
+
+@app.command
+def calibrate(
+    *curves: Annotated[
+        str, Parameter(name="CURVE", help="Stress–strain curves (.csv, .txt, .mat, .npz, .npy, .h5), of one material.")
+    ],
+    out: _Out,
+    reading: CurveOptions = CurveOptions(),
+    asked: LawOptions = LawOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Fit a material law to stress–strain curves, and say what they can and cannot tell.
+
+    Writes summary.json, calibration.png, the first thing to look at, and result.nc.
+    """
+    from .calibrate import run_calibration
+
+    with reporting(run.debug):
+        run_calibration(list(curves), out, reading, asked, run)
 
 
 @app.command

@@ -20,7 +20,7 @@ from .text_tables import Table, not_a_number, place, read_table
 
 STRESS_UNITS = {"Pa": 1e-6, "kPa": 1e-3, "MPa": 1.0, "N": None}
 """Size of each unit of stress [MPa]; a force needs the area."""
-STRAIN_UNITS = {"%": 1e-2, "-": 1.0, "stretch": 1.0, "log": 1.0, "mm": None}
+STRAIN_UNITS = {"%": 1e-2, "1": 1.0, "-": 1.0, "stretch": 1.0, "log": 1.0, "mm": None}
 """Size of each unit of strain [-]; a displacement needs the height."""
 SIGNS = ("auto", "compression", "tension")
 _TEXT = (".csv", ".tsv", ".txt", ".dat")
@@ -55,7 +55,7 @@ def read_stress_strain(
 
     Args:
         path: File to read.
-        strain: Unit of the strain: "%", "-" (a fraction), "stretch", "log", or "mm", a displacement over `height`.
+        strain: Unit of the strain: "%", "1" or "-" (a fraction), "stretch", "log", or "mm", a displacement over `height`.
         stress: Unit of the stress: "Pa", "kPa", "MPa", or "N", a force over `area`.
         columns: Of strain and stress, and, where there are more, of position [mm], force [N] and time [s]; numbers
             from 0, or names. Columns 2 and 3 count as position and force where they agree with strain and stress.
@@ -275,9 +275,9 @@ def _strain(path: Path, numbers: np.ndarray, unit: str, height: float | int | No
     largest = float(np.abs(numbers - (1.0 if unit == "stretch" else 0.0)).max())
     if unit == "%" and largest < _SMALLEST_PERCENT:
         raise MeasurementError(
-            f'{path}: the strain reaches {largest:g} %; is it a fraction? Pass strain="-", or "stretch" for stretches.'
+            f'{path}: the strain reaches {largest:g} %; is it a fraction? Pass strain="1", or "stretch" for stretches.'
         )
-    if unit in ("-", "log") and largest > _LARGEST_FRACTION:
+    if unit in ("1", "-", "log") and largest > _LARGEST_FRACTION:
         raise MeasurementError(f'{path}: the strain reaches {largest:g}; is it in per cent? Pass strain="%".')
     if unit == "stretch":
         return numbers - 1.0

@@ -116,7 +116,7 @@ def test_branches_of_a_cycle(tmp_path, branch):
     ("text", "options", "message"),
     [
         ("0,0\n10,1\n20,2\n", {}, 'pass sign="compression" or sign="tension"'),
-        ("0,0\n0.1,-1\n0.2,-2\n", {}, 'is it a fraction\\? Pass strain="-"'),
+        ("0,0\n0.1,-1\n0.2,-2\n", {}, 'is it a fraction\\? Pass strain="1"'),
         ("0,0\n10,-1\n20,-2\n", {"strain": "-"}, 'Pass strain="%"'),
         ("0,0\n10,-1\nx,-2\n30,-3\n", {}, "line 3, column 1: 'x' is not a number"),
         ("0,0\n10,-1\n,-2\n30,-3\n", {}, "line 3, column 1: has no number"),
