@@ -31,7 +31,7 @@ _FIELDS = {
 }
 _OWNERS = (
     "Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness|"
-    "find_interface|OctVolume|OctSystem|calibrate"
+    "find_interface|OctVolume|OctSystem|calibrate|axial_displacement"
 )
 _ARGUMENTS = (
     "unit|extent|spacing|std|variable|max_missing|max_bytes|missing|mask|scale|elements|element|sides|bulk|c10|c01|"

@@ -55,7 +55,7 @@ def read_stress_strain(
 
     Args:
         path: File to read.
-        strain: Unit of the strain: "%", "1" or "-" (a fraction), "stretch", "log", or "mm", a displacement over `height`.
+        strain: Unit of the strain: "%", "1" or "-" (a fraction), "stretch", "log", or "mm", displacement over `height`.
         stress: Unit of the stress: "Pa", "kPa", "MPa", or "N", a force over `area`.
         columns: Of strain and stress, and, where there are more, of position [mm], force [N] and time [s]; numbers
             from 0, or names. Columns 2 and 3 count as position and force where they agree with strain and stress.

@@ -14,16 +14,19 @@ from .maps import (
     plot_uncertainty,
 )
 from .oct import draw_interface, plot_interface
+from .phase import draw_displacement, plot_displacement
 from .scene import plot_layer
 
 __all__ = [
     "draw_calibration",
+    "draw_displacement",
     "draw_fit",
     "draw_interface",
     "draw_pictures",
     "draw_simulation",
     "plot_calibration",
     "plot_comparison",
+    "plot_displacement",
     "plot_fit",
     "plot_interface",
     "plot_layer",
