@@ -12,6 +12,7 @@ from .decks import (
 )
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
+    Calibration as Calibration,
     FitError as FitError,
     FitStatus as FitStatus,
     ForceReading as ForceReading,
@@ -19,9 +20,13 @@ from .inverse import (
     LogNormal as LogNormal,
     Matern as Matern,
     Normal as Normal,
+    ParameterFit as ParameterFit,
+    SideBulge as SideBulge,
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
     TractionFit as TractionFit,
+    calibrate as calibrate,
+    fit_parameters as fit_parameters,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,
     mesh_error as mesh_error,
@@ -33,6 +38,7 @@ from .io import (
     read_netcdf as read_netcdf,
     read_oct as read_oct,
     read_spectra as read_spectra,
+    read_stress_strain as read_stress_strain,
     read_thickness as read_thickness,
     write_netcdf as write_netcdf,
     write_oct as write_oct,
@@ -43,6 +49,7 @@ from .io import (
 from .measurement import (
     MeasurementError as MeasurementError,
     MeasurementWarning as MeasurementWarning,
+    StressStrain as StressStrain,
     ThicknessMap as ThicknessMap,
 )
 from .measurement.oct import (
@@ -51,11 +58,15 @@ from .measurement.oct import (
     SAMPLE as SAMPLE,
     SCATTERING_LAYER as SCATTERING_LAYER,
     UWA_845NM as UWA_845NM,
+    AxialIncrement as AxialIncrement,
+    DisplacementVolume as DisplacementVolume,
     Interface as Interface,
     Medium as Medium,
     OctSystem as OctSystem,
     OctVolume as OctVolume,
     Spectra as Spectra,
+    StrainVolume as StrainVolume,
+    axial_displacement as axial_displacement,
     find_interface as find_interface,
     simulate_oct as simulate_oct,
     thickness_from_oct as thickness_from_oct,
@@ -87,7 +98,9 @@ from .model import (
     Yeoh as Yeoh,
 )
 from .plot import (
+    plot_calibration as plot_calibration,
     plot_comparison as plot_comparison,
+    plot_displacement as plot_displacement,
     plot_fit as plot_fit,
     plot_interface as plot_interface,
     plot_layer as plot_layer,

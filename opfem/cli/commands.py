@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .curve_options import CurveOptions, LawOptions
 from .deck_options import DeckOptions, WriteOptions
 from .messages import say
 from .options import (
@@ -196,11 +197,15 @@ def deck(
 @app.command
 def oct(
     loaded: Annotated[
-        str, Parameter(name="LOADED", help="OCT volume of the loaded layer: .oct, .h5, .mat, .npy, .tif, raw.")
-    ],
+        str | None, Parameter(name="LOADED", help="OCT volume of the loaded layer: .oct, .h5, .mat, .npy, .tif, raw.")
+    ] = None,
     /,
     *,
     out: _Out,
+    phase: Annotated[
+        tuple[str, str] | None,
+        Parameter(help="BEFORE AFTER: two complex volumes, whose phase tells the axial displacement between them."),
+    ] = None,
     unloaded: Annotated[str | None, Parameter(help="OCT volume of the unloaded layer.")] = None,
     l0: Annotated[
         float | None, Parameter(help="Unloaded thickness in mm, instead of a volume.", validator=positive("mm"))
@@ -210,15 +215,42 @@ def oct(
     asked: InterfaceOptions = InterfaceOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
-    """Measure the thickness of the layer in an OCT volume.
+    """Measure the thickness of the layer in an OCT volume, or the displacement between two.
 
     Writes thickness.npz, which palpate and fit take with its noise and mask, unloaded.npz with --unloaded,
-    interface.npz, summary.json and two pictures: bscans.png, the first thing to look at, and maps.png.
+    interface.npz, summary.json and two pictures: bscans.png, the first thing to look at, and maps.png. With --phase
+    displacement.npz, displacement.png and summary.json.
     """
     from .oct import measure
+    from .phase import measure_phase
 
     with reporting(run.debug):
+        if (loaded is None) == (phase is None):
+            raise ValueError("opfem oct takes either LOADED or --phase BEFORE AFTER.")
+        if phase is not None:
+            return measure_phase(phase, out, reading, microscope, run)
+        assert loaded is not None
         measure(loaded, out, unloaded, l0, reading, microscope, asked, run)
+
+
+@app.command
+def calibrate(
+    *curves: Annotated[
+        str, Parameter(name="CURVE", help="Stress–strain curves (.csv, .txt, .mat, .npz, .npy, .h5), of one material.")
+    ],
+    out: _Out,
+    reading: CurveOptions = CurveOptions(),
+    asked: LawOptions = LawOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Fit a material law to stress–strain curves, and say what they can and cannot tell.
+
+    Writes summary.json, calibration.png, the first thing to look at, and result.nc.
+    """
+    from .calibrate import run_calibration
+
+    with reporting(run.debug):
+        run_calibration(list(curves), out, reading, asked, run)
 
 
 @app.command

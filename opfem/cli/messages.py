@@ -27,15 +27,17 @@ _FIELDS = {
     "Matern.mean": "--prior-mean",
     "Checkpoint.path": "--checkpoint",
     "smoothed.fwhm": "--smooth",
+    "calibrate.bulk": "--bulk-ratio",
 }
 _OWNERS = (
     "Palpation|MooneyRivlin|ExponentialOverclosure|Newton|Explicit|Imprint|fit_traction|ThicknessMap|read_thickness|"
-    "find_interface|OctVolume|OctSystem|read_inp"
+    "find_interface|OctVolume|OctSystem|calibrate|axial_displacement|read_inp"
 )
 _ARGUMENTS = (
     "unit|extent|spacing|std|variable|max_missing|max_bytes|missing|mask|scale|elements|element|sides|bulk|c10|c01|"
     "increments|duration|mass_scaling|precision|checkpoint|correct_approach|hyperparameters|nonnegative|model_std|draws|"
-    "depth_spacing|index_applied|optical_spacing|shape|order|dtype|edge|search|average|max_slope|confidence|window|code|layer|interpolation"
+    "depth_spacing|index_applied|optical_spacing|shape|order|dtype|edge|search|average|max_slope|confidence|window|"
+    "strain|stress|columns|sign|kind|mode|branch|area|height|diameter|terms|weights|platens|code|layer|interpolation"
 )
 _FIELD = re.compile("|".join(map(re.escape, _FIELDS)) + rf"|\b(?:{_OWNERS})\.({_ARGUMENTS})\b")
 _CALL = re.compile(rf"\b(?:{_OWNERS})\(({_ARGUMENTS})=\.\.\.\)")

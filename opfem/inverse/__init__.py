@@ -1,5 +1,7 @@
 """From measured thickness to traction: least squares through the solver, and faster estimates."""
 
+from .calibration import calibrate as calibrate
+from .calibration_result import Calibration as Calibration
 from .data import AxialDisplacement as AxialDisplacement, ForceReading as ForceReading
 from .estimates import (
     LinearEstimate as LinearEstimate,
@@ -8,7 +10,9 @@ from .estimates import (
 )
 from .fit import fit_traction as fit_traction
 from .model_error import mesh_error as mesh_error
+from .parameter_fit import ParameterFit as ParameterFit, fit_parameters as fit_parameters
 from .parameters import LogNormal as LogNormal, Normal as Normal
 from .prior import Matern as Matern, Tikhonov as Tikhonov, TotalVariation as TotalVariation
 from .refit import refitted as refitted
 from .result import FitError as FitError, FitStatus as FitStatus, TractionFit as TractionFit
+from .state_observations import SideBulge as SideBulge

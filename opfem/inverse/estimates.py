@@ -8,11 +8,10 @@ from jaxtyping import Array, Float
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
-from ..model.deformation import kinematics
-from ..model.material import AbstractMaterial
 from ..model.plausible import check_against_layer
 from ..solvers.compiling import QuickJit
 from .conjugate_gradients import LeastSquares, least_squares
+from .homogeneous import cauchy_stress
 from .noise import noise_std
 from .observation import Nodes, Observation, observe
 from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes
@@ -21,8 +20,6 @@ from .transfer import Base, poisson_ratio, transfer_function, wave_numbers
 # Relative gradient at which the linear estimate counts as solved, and most iterations.
 _RTOL = 1e-8
 _STEPS = 1000
-# Passes that find the volume ratio in uniaxial compression; each shortens the error by about shear / bulk.
-_VOLUME_STEPS = 60
 
 
 class LinearEstimate(eqx.Module):
@@ -110,21 +107,4 @@ def uniaxial_estimate(palpation: Palpation, thickness: ThicknessMap) -> Nodes:
     check_against_layer("uniaxial_estimate.thickness", thickness, palpation.layer.thickness, palpation.extent, 3)
     mesh = palpation.mesh()
     stretch = thickness.sample(*mesh.plane()) / mesh.thickness
-    return -uniaxial_stress(palpation.layer.material, stretch)
-
-
-def uniaxial_stress(material: AbstractMaterial, stretch: Array) -> Array:
-    """Compute the Cauchy stress [MPa] at an axial stretch [-], the sides free."""
-
-    def stresses(J):
-        side = jnp.sqrt(J / stretch)
-        zero = jnp.zeros_like(stretch)
-        rows = [[side - 1.0, zero, zero], [zero, side - 1.0, zero], [zero, zero, stretch - 1.0]]
-        P = material.isochoric_piola(kinematics(jnp.stack([jnp.stack(row) for row in rows])))
-        return P[0, 0] * side / J, P[2, 2] * stretch / J
-
-    def closer(_, J):
-        return 1.0 - stresses(J)[0] / material.bulk
-
-    lateral, axial = stresses(jax.lax.fori_loop(0, _VOLUME_STEPS, closer, jnp.ones_like(stretch)))
-    return axial - lateral
+    return -cauchy_stress(palpation.layer.material, stretch)

@@ -5,6 +5,7 @@ from .atomic import finish, take_place, whole_file, write_together, write_whole
 from .checkpoint import Checkpoint as Checkpoint
 from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
 from .oct import read_oct, read_spectra, write_oct
+from .stress_strain import read_stress_strain
 from .thickness import read_thickness, write_thickness
 from .vtk import bodies_grid, layer_grid, vtu_bytes, write_pvd, write_vtu
 
@@ -17,6 +18,7 @@ __all__ = [
     "read_netcdf",
     "read_oct",
     "read_spectra",
+    "read_stress_strain",
     "read_thickness",
     "take_place",
     "vtu_bytes",

@@ -2,6 +2,15 @@
 
 from .errors import MeasurementError, MeasurementWarning
 from .example import EXAMPLE_LAYER, example_map
+from .stress_strain import StressStrain
 from .thickness import Step, ThicknessMap
 
-__all__ = ["EXAMPLE_LAYER", "MeasurementError", "MeasurementWarning", "Step", "ThicknessMap", "example_map"]
+__all__ = [
+    "EXAMPLE_LAYER",
+    "MeasurementError",
+    "MeasurementWarning",
+    "Step",
+    "StressStrain",
+    "ThicknessMap",
+    "example_map",
+]

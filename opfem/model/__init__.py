@@ -33,6 +33,10 @@ from .overclosure import (
 )
 from .palpation import Palpation as Palpation
 from .sample import Sample as Sample
-from .stability import extreme_stretches as extreme_stretches, unstable_stretch as unstable_stretch
+from .stability import (
+    extreme_stretches as extreme_stretches,
+    stable_stretches as stable_stretches,
+    unstable_stretch as unstable_stretch,
+)
 from .stretch_material import Hencky as Hencky, Ogden as Ogden
 from .surface import HeightField as HeightField, height_field as height_field

@@ -31,9 +31,14 @@ LogStrain = Float[Numbers, "3 *points"]
 
 
 class AbstractMaterial(eqx.Module):
-    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa], each a field or a property."""
+    """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa], each a field or a property.
+
+    `calibrated` holds the least and the largest principal stretch [-] of the tests that its numbers come from; solves
+    compare with it what they reached (`stats["beyond_calibration"]`). None: not known.
+    """
 
     bulk: eqx.AbstractVar[Array]
+    calibrated: tuple[float, float] | None = eqx.field(static=True, default=None, kw_only=True)
     if TYPE_CHECKING:  # as an abstract field it would count as an argument of laws whose shear modulus is a property
 
         @property

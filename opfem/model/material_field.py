@@ -23,7 +23,7 @@ _WIDER: dict[type, dict[type, Callable]] = {
 
 def numbers_of(law: AbstractMaterial) -> dict[str, Array]:
     """Return the numbers of a law by name [MPa]."""
-    return {name: getattr(law, name) for name in law.__dataclass_fields__}
+    return {name: getattr(law, name) for name in law.__dataclass_fields__ if name != "calibrated"}
 
 
 def points_of(law: AbstractMaterial) -> tuple[int, ...]:
@@ -56,7 +56,7 @@ def combined(
     merged = {name: jnp.broadcast_to(value, shape) for name, value in values[0].items()}
     for (inside, _), numbers in zip(inclusions, values[1:], strict=True):
         merged = {name: jnp.where(inside, numbers[name], value) for name, value in merged.items()}
-    return type(laws[0])(**merged)
+    return type(laws[0])(**merged)  # pyright: ignore[reportArgumentType]
 
 
 def widened(laws: Sequence[AbstractMaterial]) -> list[AbstractMaterial]:

@@ -15,11 +15,14 @@ from jaxtyping import Array, Float
 from .deformation import Kinematics
 from .material import AbstractMaterial
 
-# Exponents of the stretch in each mode: uniaxial, equibiaxial, planar; all at constant volume.
-_MODES = np.array([[1.0, -0.5, -0.5], [1.0, 1.0, -2.0], [1.0, 0.0, -1.0]]).T
+# Exponents of the stretch in each mode, all at constant volume.
+_EXPONENTS = {"uniaxial": [1.0, -0.5, -0.5], "equibiaxial": [1.0, 1.0, -2.0], "planar": [1.0, 0.0, -1.0]}
+_MODES = np.array(list(_EXPONENTS.values())).T
 # Stretches looked at in each mode, from the smallest reached to the largest, and what their ends may be off.
 _SAMPLES = 200
 _ROUNDING = 1e-6
+# Stretches that `stable_stretches` looks at: their spacing is a thousandth.
+_FINE = 2001
 
 
 def extreme_stretches(k: Kinematics) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -62,13 +65,42 @@ def unstable_stretch(material: AbstractMaterial, smallest: Any, largest: Any) ->
     low, high = xp.log(smallest), xp.log(largest)
     strain = _MODES[:, :, None] * (low + (high - low) * np.linspace(0.0, 1.0, _SAMPLES))
     reached = xp.all((strain >= low - _ROUNDING) & (strain <= high + _ROUNDING), axis=0)
-    H = xp.asarray(material.log_stiffness(strain))
-    # At constant volume the third strain is minus the sum of the others.
-    D11, D22 = (H[a, a] + H[2, 2] - 2.0 * H[a, 2] for a in range(2))
-    D12 = H[0, 1] - H[0, 2] - H[1, 2] + H[2, 2]
-    unstable = reached & ~((D11 + D22 > 0) & (D11 * D22 > D12**2))
+    unstable = reached & ~_is_stable(material, strain)
     size = xp.max(xp.abs(strain), axis=0)
     first = xp.argmin(xp.where(unstable, size, np.inf))
     at = strain.reshape(3, -1)[:, first]
     stretch = xp.exp(at[xp.argmax(xp.abs(at))])
     return jnp.asarray(xp.where(xp.any(unstable), stretch, 0.0))
+
+
+def stable_stretches(material: AbstractMaterial, low: float = 0.3, high: float = 3.0) -> dict[str, tuple[float, float]]:
+    """Find the stretches around rest over which a law is stable in each mode [-].
+
+    Args:
+        material: The law; its numbers are known and the same everywhere.
+        low: Least stretch to look at [-].
+        high: Largest stretch to look at [-].
+
+    Returns:
+        Of every mode the least and the largest stretch; those looked at where it is stable throughout.
+    """
+    material = jax.tree.map(np.asarray, material)
+    log = np.linspace(np.log(low), np.log(high), _FINE)
+    rest = int(np.argmin(np.abs(log)))
+    ranges: dict[str, tuple[float, float]] = {}
+    for mode, exponents in _EXPONENTS.items():
+        unstable = ~_is_stable(material, np.array(exponents)[:, None] * log)
+        below, above = np.flatnonzero(unstable[:rest]), np.flatnonzero(unstable[rest:])
+        ends = log[below[-1]] if below.size else log[0], log[rest + above[0]] if above.size else log[-1]
+        ranges[mode] = float(np.exp(ends[0])), float(np.exp(ends[1]))
+    return ranges
+
+
+def _is_stable(material: AbstractMaterial, strain: Any) -> Any:
+    """Tell where every small change at constant volume does positive work on its own stress change."""
+    xp = np if isinstance(strain, np.ndarray) else jnp
+    H = xp.asarray(material.log_stiffness(strain))
+    # At constant volume the third strain is minus the sum of the others.
+    D11, D22 = (H[a, a] + H[2, 2] - 2.0 * H[a, 2] for a in range(2))
+    D12 = H[0, 1] - H[0, 2] - H[1, 2] + H[2, 2]
+    return (D11 + D22 > 0) & (D11 * D22 > D12**2)

@@ -1,5 +1,6 @@
 """Pictures: maps, and the layer in three dimensions. `import opfem` does not load it: it loads matplotlib."""
 
+from .calibration import draw_calibration, plot_calibration
 from .deck import draw_deck
 from .experiment import draw_simulation, plot_comparison, plot_section
 from .maps import (
@@ -14,15 +15,20 @@ from .maps import (
     plot_uncertainty,
 )
 from .oct import draw_interface, plot_interface
+from .phase import draw_displacement, plot_displacement
 from .scene import plot_layer
 
 __all__ = [
+    "draw_calibration",
     "draw_deck",
+    "draw_displacement",
     "draw_fit",
     "draw_interface",
     "draw_pictures",
     "draw_simulation",
+    "plot_calibration",
     "plot_comparison",
+    "plot_displacement",
     "plot_fit",
     "plot_interface",
     "plot_layer",

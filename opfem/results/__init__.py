@@ -1,6 +1,6 @@
 """What a solution says: labelled data with units, and a short summary for people."""
 
-from ..inverse import TractionFit
+from ..inverse import Calibration, TractionFit
 from ..solvers import ExperimentSolution, Solution
 from .compare import Comparison, FieldMetrics, compare
 from .dataset import to_xarray
@@ -10,6 +10,7 @@ from .oct_scene import OctScene, oct_scene
 from .summary import summary, summary_rows
 
 __all__ = [
+    "Calibration",
     "Comparison",
     "ExperimentSolution",
     "FieldMetrics",

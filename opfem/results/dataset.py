@@ -48,6 +48,10 @@ STATS = {
     "min_volume_ratio": ("1", "smallest volume ratio J in the layer"),
     "min_stretch": ("1", "smallest principal stretch in the layer, volume change taken out"),
     "max_stretch": ("1", "largest principal stretch in the layer, volume change taken out"),
+    "beyond_calibration": (
+        "1",
+        "principal stretch over the largest the material was calibrated for, or below its least",
+    ),
     "unstable_stretch": ("1", "stretch reached from which on the material law is unstable, 0: none"),
     "increment": ("s", "shortest time increment"),
     "kinetic_ratio": ("1", "largest kinetic over all energy after the first tenth of the load"),

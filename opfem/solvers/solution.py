@@ -61,11 +61,16 @@ def is_failure(result: RESULTS) -> Bool[Array, ""]:
 
 
 def judged(solution: "AnySolution") -> "AnySolution":
-    """Note in stats and status where a solve stretched elements beyond what its law is stable for."""
+    """Note in stats and status where a solve stretched elements beyond what its law is stable or calibrated for."""
     stats = solution.stats
     layer = solution.palpation.layer if isinstance(solution, Solution) else solution.experiment.layer
     unstable = unstable_stretch(layer.material, stats["min_stretch"], stats["max_stretch"])
-    solution = dataclasses.replace(solution, stats={**stats, "unstable_stretch": unstable})
+    stats = {**stats, "unstable_stretch": unstable}
+    if layer.material.calibrated is not None:
+        low, high = layer.material.calibrated
+        beyond = jnp.maximum(stats["max_stretch"] / high, low / stats["min_stretch"]) - 1.0
+        stats["beyond_calibration"] = jnp.maximum(beyond, 0.0)
+    solution = dataclasses.replace(solution, stats=stats)
     known = concrete(unstable)
     if known is not None and not known:
         return solution

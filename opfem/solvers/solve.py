@@ -91,7 +91,9 @@ def solve(
         `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
         `max_penetration` and `side_overlap` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
         stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
-        law is unstable, 0 if it was stable as far as it was stretched). Of an experiment `force_sample`
+        law is unstable, 0 if it was stable as far as it was stretched). With a law from `calibrate`
+        `beyond_calibration` [-]: by how much of themselves stretches left those of the tests, 0 if
+        they did not. Of an experiment `force_sample`
         is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
         Derivatives of an experiment are NaN for now: their linear systems do not converge.
 

@@ -87,3 +87,21 @@ def test_what_is_wrong_is_said_in_one_line(volumes, tmp_path, capsys):
     assert "--edge" in said
     assert opfem("oct", volumes / "loaded.oct", "--l0", 0.5, "--unloaded", "x.oct", "--out", tmp_path / "o") == 1
     assert "leave one out" in capsys.readouterr().err
+
+
+def test_displacement_from_phase(tmp_path, capsys):
+    pair = op.simulate_oct(
+        op.UWA_845NM, lambda x, y: np.full_like(x, 0.3), key=jax.random.key(0), spacing=(0.01, 0.01), shape=(12, 16),
+        depth=0.3, increment=lambda x, y, z: (0 * z, 0 * z, -1e-3 * z), media=(op.Medium(0.0, 0.5), op.SAMPLE),
+    )  # fmt: skip
+    for name, volume in zip(("before", "after"), pair, strict=True):
+        op.write_oct(volume, tmp_path / f"{name}.h5")
+    out = tmp_path / "out"
+    assert opfem("oct", "--phase", tmp_path / "before.h5", tmp_path / "after.h5", "--out", out) == 0
+    numbers = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert numbers["strain_median"] == pytest.approx(-1e-3, rel=0.02)
+    with np.load(out / "displacement.npz") as stored:
+        assert stored["values"].shape == pair[0].shape
+    assert (out / "displacement.png").is_file()
+    assert opfem("oct", "--out", tmp_path / "none") == 1
+    assert "either LOADED or --phase" in capsys.readouterr().err

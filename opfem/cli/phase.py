@@ -1,0 +1,103 @@
+"""`opfem oct --phase BEFORE AFTER --out DIR`: the axial displacement between two complex volumes."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ..io import write_together
+from ..measurement.oct import DisplacementVolume, OctSystem, axial_displacement
+from ..solvers.progress import Progress
+from .folder import prepare, refuse_links
+from .oct import read_volume
+from .options import MicroscopeOptions, RunOptions, VolumeOptions
+from .statement import configure_jax
+
+FILES = ("displacement.png", "summary.json", "displacement.npz")
+"""What the command writes; the last marks a finished result."""
+
+
+def measure_phase(
+    paths: tuple[str, str], out: Path, reading: VolumeOptions, microscope: MicroscopeOptions, run: RunOptions
+) -> None:
+    """Measure the displacement and write it.
+
+    Args:
+        paths: Files of the volumes before and after.
+        out: Folder of the results.
+        reading: How to read the volumes.
+        microscope: The microscope.
+        run: The run itself.
+    """
+    with Progress(True, at_once=True) as progress:
+        progress.stage("reading")
+        configure_jax(run.no_cache)
+        refuse_links(out, FILES)
+        if (out / FILES[-1]).exists() and not run.force:
+            raise FileExistsError(
+                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
+            )
+        before, after = (read_volume(path, reading) for path in paths)
+        prepare(out)
+        progress.stage("displacement")
+        found = axial_displacement(before, after, OctSystem(**dataclasses.asdict(microscope)))
+        progress.stage("pictures")
+        from ..plot import draw_displacement
+
+        picture = io.BytesIO()
+        draw_displacement(found).savefig(picture, dpi=150)
+        numbers = {"before": paths[0], "after": paths[1], **_numbers(found)}
+        contents = {
+            "displacement.png": picture.getvalue(),
+            "summary.json": (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode(),
+            "displacement.npz": _bytes(found),
+        }
+        write_together(out, contents, FILES)
+    console = Console(highlight=False)
+    console.print(
+        f"displacement {numbers['displacement_min_nm']:.0f} to {numbers['displacement_max_nm']:.0f} nm, standard "
+        f"deviation {numbers['std_median_nm']:.2g} nm, strain {numbers['strain_median']:.3%}, coherence "
+        f"{numbers['coherence_median']:.2f}, {numbers['masked_share']:.1%} masked",
+        markup=False,
+        soft_wrap=True,
+    )
+    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)
+
+
+def _numbers(found: DisplacementVolume) -> dict[str, Any]:
+    kept = ~found.mask
+    strain = found.strain()
+    known = ~strain.mask
+    return {
+        "masked_share": float(found.mask.mean()),
+        "displacement_min_nm": 1e6 * float(found.values[kept].min()),
+        "displacement_max_nm": 1e6 * float(found.values[kept].max()),
+        "std_median_nm": 1e6 * float(np.median(found.std[kept])),
+        "scale_std": float(found.scale_std),
+        "coherence_median": float(np.median(found.coherence)),
+        "strain_median": float(np.median(strain.values[known])) if known.any() else None,
+    }
+
+
+def _bytes(found: DisplacementVolume) -> bytes:
+    held = io.BytesIO()
+    fields = {
+        name: np.asarray(getattr(found, name))
+        for name in (
+            "values",
+            "std",
+            "coherence",
+            "depth",
+            "spacing",
+            "origin",
+            "scale_std",
+            "noise_length",
+            "axial_noise",
+        )
+    }
+    np.savez_compressed(held, mask=found.mask, **fields)  # pyright: ignore[reportArgumentType]
+    return held.getvalue()
