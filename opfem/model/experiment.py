@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,6 +20,7 @@ from .contact import Bonded, Contact, Roller, Side
 from .inclusion import AbstractInclusion
 from .layer import Layer
 from .material import AbstractMaterial
+from .material_field import numbers_of, widened
 from .mesh import BlockMesh, LayerMesh
 from .palpation import named_sides
 from .sample import Sample
@@ -123,6 +125,12 @@ class Experiment(eqx.Module):
                 )
         if isinstance(self.interface, Bonded):
             _check_bonded(self.layer_mesh(), self.sample_mesh())
+            self.bonded_material()
+            if self.element[0] != self.element[1]:
+                raise ValueError(
+                    "Experiment.interface=Bonded() makes one block of layer and sample: element must be the same for "
+                    f"both, got {self.element}."
+                )
         _check_inclusions(self)
 
     def __pdoc__(self, **options: Any) -> Any:
@@ -157,6 +165,25 @@ class Experiment(eqx.Module):
         thickness = self.sample.thickness_at(*flat.plane())
         below = (1.0 - self.sample.fractions(nz))[:, None, None] * thickness  # of the plate
         return BlockMesh(self.plate_height - below, self.extent)
+
+    def bonded_mesh(self) -> BlockMesh:
+        """Build the mesh of layer and sample as one block, where they share nodes."""
+        heights = jnp.concatenate([self.layer_mesh().node_heights(), self.sample_mesh().heights[1:]])
+        return BlockMesh(heights, self.extent)
+
+    def bonded_material(self) -> AbstractMaterial:
+        """Build the law of layer and sample as one block, with a number for each element `(nz, ny, nx)`.
+
+        Raises:
+            ValueError: If their laws are of kinds that neither includes.
+        """
+        nx, ny, _ = self.layer_elements
+        laws = widened([self.layer.material, self.sample_material()])
+        numbers = [
+            {name: jnp.broadcast_to(value, (nz, ny, nx)) for name, value in numbers_of(law).items()}
+            for law, (_, _, nz) in zip(laws, self.elements, strict=True)
+        ]
+        return type(laws[0])(**jax.tree.map(lambda *parts: jnp.concatenate(parts), *numbers))
 
     def sample_centres(self) -> tuple[Array, Array, Array]:
         """Compute x, y and depth [mm] of the centres of the sample's elements, each `(nz, ny, nx)`.

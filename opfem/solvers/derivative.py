@@ -59,7 +59,8 @@ def follow_path(
                     tangent = slowed.tangent(solve.x, solve.fraction, state, None, transposed)
                     if transposed:
                         A = _transposed_product(slowed, solve.x, solve.fraction, state, solve.held)
-                    return _solve(slowed, tangent, transposed, solve.held, A, c, is_known, settings)
+                    from_left = transposed and slowed.left_transpose
+                    return _solve(slowed, tangent, from_left, solve.held, A, c, is_known, settings)
 
                 return solved
 
@@ -266,7 +267,7 @@ def _solve_kept(problem: Problem, slot: Slot, b: Unknowns, transposed: Array, se
 def _solve(
     problem: AbstractProblem,
     tangent: AbstractTangent,
-    transposed: bool,
+    from_left: bool,
     held: Array,
     matvec,
     b: Unknowns,
@@ -275,14 +276,14 @@ def _solve(
 ) -> Unknowns:
     """Solve with the tangent of the balance, or its transpose, by corrections in float32; else NaN.
 
-    The residual of a transposed system is measured as the move that it stands for (`solve_tangent`).
+    Where preconditioned from the left, the residual is measured as the move that it stands for (`solve_tangent`).
     """
 
     def measure(r: Unknowns) -> tuple[Array, Unknowns | None]:
-        if not transposed:
+        if not from_left:
             return problem.size(r), None
         inside = problem.inside(r, held)
-        move = tangent.precondition(inside.scaled(problem.stress_scale))
+        move = problem.precondition(tangent, inside.scaled(problem.stress_scale), held)
         pushed = problem.size(move.scaled(1.0 / problem.stress_scale))
         return problem.size(
             r._replace(u=jax.tree.map(jnp.subtract, r.u, inside.u))
@@ -296,7 +297,7 @@ def _solve(
         target = jnp.where(count == 0, _RTOL * size, target)
 
         def corrected():
-            change, _ = _correction(problem, tangent, transposed, held, r, settings, move)
+            change, _ = _correction(problem, tangent, from_left, held, r, settings, move)
             return jax.tree.map(jnp.add, x, change)
 
         solved = size <= target
@@ -336,7 +337,7 @@ def _transposed_product(problem: AbstractProblem, x: Unknowns, fraction: Array, 
 def _correction(
     problem: AbstractProblem,
     tangent: AbstractTangent,
-    transposed: bool,
+    from_left: bool,
     held: Array,
     r: Unknowns,
     settings: Newton,
@@ -344,7 +345,7 @@ def _correction(
 ) -> tuple[Unknowns, Array]:
     """Solve with the tangent of the balance once, in float32; also return the relative residual it left."""
     inside = problem.inside(r, held)
-    result = solve_tangent(problem, tangent, inside, held, settings, transposed, preconditioned)
+    result = solve_tangent(problem, tangent, inside, held, settings, from_left, preconditioned)
     change = problem.inside(result.x, held)
     # Supports and held motion: the balance has a spring to where they are prescribed.
     k = problem.typical_stiffness

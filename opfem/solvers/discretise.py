@@ -171,11 +171,6 @@ def _check_experiment(experiment: Any, load: Any, start: Any) -> None:
         raise ValueError(f"An Experiment takes Compression(approach) [mm], got {type(load).__name__}.")
     if start is not None and not isinstance(start, Compression):
         raise ValueError(f"start must be a solved Experiment, got a solution under {type(start).__name__}.")
-    if isinstance(experiment.interface, Bonded):
-        raise ValueError(
-            "Newton does not solve an Experiment with interface=Bonded() yet. Pass Contact(law, friction), with a "
-            "friction that nothing slides at."
-        )
     check_approach(load.approach, experiment.plate_height)
 
 

@@ -5,7 +5,7 @@ Displacements are PyTrees: an array of nodes, or a tuple of them, one for each b
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -56,9 +56,11 @@ class AbstractProblem(eqx.Module):
 
     Attributes:
         viscosity: Of the medium that slows bodies on their way through a snap [-], else 0.
+        left_transpose: Whether the transposed tangent is preconditioned from the left (`solve_tangent`).
     """
 
     viscosity: eqx.AbstractVar[Array]
+    left_transpose: ClassVar[bool] = True
 
     @property
     def free(self) -> PyTree:
@@ -112,10 +114,6 @@ class AbstractProblem(eqx.Module):
         """Build the undeformed state at load fraction zero."""
         raise NotImplementedError
 
-    def touching(self, state: State, increment: Array) -> State:
-        """Build the state before an undeformed one that the first increment extrapolates from: here itself."""
-        return state
-
     def initial_iterates(self, state: State) -> tuple:
         """Start the iteration from the contact of a converged state."""
         raise NotImplementedError
@@ -143,6 +141,10 @@ class AbstractProblem(eqx.Module):
             transposed: Whether to return the transposed tangent.
             points: `locate(x.u, fraction, state, bends=True)`, where that is known.
         """
+        raise NotImplementedError
+
+    def precondition(self, tangent: Any, r: Unknowns, held: Array) -> Unknowns:
+        """Approximate the solution of a tangent system, without the held rigid motions."""
         raise NotImplementedError
 
     def advance(

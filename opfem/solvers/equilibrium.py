@@ -314,6 +314,12 @@ class Problem(AbstractProblem):
         )
         return tangent.transposed() if transposed else tangent
 
+    def precondition(self, tangent: Tangent, r: Unknowns, held: Array) -> Unknowns:
+        """Approximate the solution of a tangent system, without the held rigid motions."""
+        # The hold acts on the window face, but what it prevents is motion of the whole body.
+        x = tangent.precondition(r)
+        return x._replace(u=self.without_drift(x.u, held))
+
     def _drag(self, viscosity: Array) -> Array:
         """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
         return viscosity * self.body.shear * self.body.cells.element_depth

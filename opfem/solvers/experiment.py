@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -12,10 +13,15 @@ from ..mechanics.face import FaceRule
 from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import layer_body, typical
 from ..model import AbstractMaterial, BlockMesh, Bonded, Compression, Contact, Experiment, LayerMesh, Roller, Side
+from .equations import State
 from .equilibrium import Problem
 from .stack import Stack
 from .supports import Supports, drift_modes
 from .tangent import VOLUME_GUARD
+
+# A first guess closes every contact to this share of the lower body's shear modulus: enough for laws that start without
+# stiffness to have some, too little to deform anything.
+_TOUCH = 1e-3
 
 _KINDS = {Bonded: "bonded", Roller: "roller", Contact: "contact"}
 _PLATE_KINDS = {Bonded: "bonded", Roller: "uz", Contact: "contact"}
@@ -23,8 +29,8 @@ _PLATE_KINDS = {Bonded: "bonded", Roller: "uz", Contact: "contact"}
 
 def discretise_experiment(
     experiment: Experiment, load: Compression, start: Compression | None, rule: FaceRule
-) -> Stack:
-    """Build the discrete problem of a layer and a sample in contact.
+) -> Stack | Problem:
+    """Build the discrete problem: a layer and a sample in contact, or one block of both where they are bonded.
 
     Args:
         experiment: The experiment.
@@ -32,41 +38,15 @@ def discretise_experiment(
         start: That at load fraction 0; None for bodies that just touch.
         rule: Where contact is integrated.
     """
-    lower, upper = experiment.layer_mesh(), experiment.sample_mesh()
-    soft, material = experiment.layer.material, experiment.sample_material()
-    approach = jnp.zeros_like(load.approach) if start is None else start.approach
-    plate = RigidPlate(experiment.plate_height - approach, experiment.plate_height - load.approach)
-    window = _face(experiment.window, RigidSurface(None, None), False, lower, soft, rule)
-    pressed = _face(experiment.plate, plate, True, upper, material, rule)
-    layer_form, sample_form = experiment.element
-    held = experiment.hold is not None
-    layer = _body(
-        experiment,
-        lower,
-        soft,
-        layer_form,
-        Supports(_KINDS[type(experiment.window)], "contact", experiment.sides, held),
-        Bodies(window, None),
-        None,
-    )
-    move = None
-    if not isinstance(experiment.plate, Contact):
-        top = jnp.ones_like(upper.heights[-1])
-        move = (-approach * top, -load.approach * top)
-    sample = _body(
-        experiment,
-        upper,
-        material,
-        sample_form,
-        Supports("contact", _PLATE_KINDS[type(experiment.plate)], experiment.sides, held),
-        Bodies(None, pressed),
-        move,
-    )
-    exact = isinstance(experiment.interface, Contact) and experiment.interface.law.exact
+    layer, sample = single_bodies(experiment, load, start, rule)
+    if isinstance(experiment.interface, Bonded):
+        return _joined(experiment, layer, sample)
+    lower, upper, soft = experiment.layer_mesh(), experiment.sample_mesh(), experiment.layer.material
+    exact = experiment.interface.law.exact
     # The sample's face is curved, and gives way: more conditions than the layer's face has nodes could not all be met.
     face = _face(experiment.interface, RigidSurface(None, None), True, lower, soft, "nodes" if exact else rule)
     assert face is not None
-    between = 1.0 / (1.0 / face.stiffness + 1.0 / _stiffness(upper, material))
+    between = 1.0 / (1.0 / face.stiffness + 1.0 / _stiffness(upper, experiment.sample_material()))
     x0, x1, y0, y1 = (side == "free" for side in experiment.sides)
     pair = ContactPair(
         face=dataclasses.replace(face, stiffness=between),
@@ -76,6 +56,64 @@ def discretise_experiment(
         rims=(x0, x1, y0, y1),
     )
     return Stack(lower=layer, upper=sample, pair=pair, viscosity=jnp.zeros((), layer.positions.dtype))
+
+
+def single_bodies(
+    experiment: Experiment, load: Compression, start: Compression | None, rule: FaceRule
+) -> tuple[Problem, Problem]:
+    """Build layer and sample, each between its rigid surface and the other; arguments as in `discretise_experiment`."""
+    lower, upper = experiment.layer_mesh(), experiment.sample_mesh()
+    soft, material = experiment.layer.material, experiment.sample_material()
+    approach = jnp.zeros_like(load.approach) if start is None else start.approach
+    plate = RigidPlate(experiment.plate_height - approach, experiment.plate_height - load.approach)
+    window = _face(experiment.window, RigidSurface(None, None), False, lower, soft, rule)
+    pressed = _face(experiment.plate, plate, True, upper, material, rule)
+    interface, sides = _KINDS[type(experiment.interface)], experiment.sides
+    held = experiment.hold is not None
+    supports = Supports(_KINDS[type(experiment.window)], interface, sides, held)
+    layer = _body(experiment, lower, soft, experiment.element[0], supports, Bodies(window, None), None)
+    move = None
+    if not isinstance(experiment.plate, Contact):
+        top = jnp.ones_like(upper.heights[-1])
+        move = (-approach * top, -load.approach * top)
+    supports = Supports(interface, _PLATE_KINDS[type(experiment.plate)], sides, held)
+    sample = _body(experiment, upper, material, experiment.element[1], supports, Bodies(None, pressed), move)
+    return layer, sample
+
+
+def touching(problem: Stack | Problem, state: State, increment: Array) -> State:
+    """Build the state before an undeformed one from which an increment extrapolates to touching bodies."""
+    stacked = isinstance(problem, Stack)
+    lower = problem.lower if stacked else problem
+    faces = (lower.contacts.window, problem.pair.face) if stacked else (lower.contacts.window,)
+    pressure, shift = _TOUCH * lower.body.shear, jnp.zeros((), state.fraction.dtype)
+    before = []
+    for face, u in zip(faces, state.u if stacked else (state.u,), strict=True):
+        if face is not None:
+            law = face.own_contact.law
+            shift = shift + law.zero_pressure_clearance - law.clearance_at(pressure, face.stiffness)
+        before.append(jnp.concatenate([u[:2], u[2:] + shift / increment]))
+    earlier = tuple(before) if stacked else before[0]
+    return eqx.tree_at(lambda s: [s.u, s.fraction], state, [earlier, state.fraction - 1.0])
+
+
+def _joined(experiment: Experiment, layer: Problem, sample: Problem) -> Problem:
+    """Make one block of a layer and a sample that share nodes."""
+    window, plate = layer.contacts.window, sample.contacts.sample
+    if window is not None and plate is not None:
+        # They may be evaluated as one, with one scale of hard contact: that of the softer body.
+        softer = jnp.minimum(window.stiffness, plate.stiffness)
+        window, plate = (dataclasses.replace(face, stiffness=softer) for face in (window, plate))
+    supports = Supports(layer.supports.window, sample.supports.interface, experiment.sides, layer.supports.spring)
+    return _body(
+        experiment,
+        experiment.bonded_mesh(),
+        experiment.bonded_material(),
+        experiment.element[0],
+        supports,
+        Bodies(window, plate),
+        sample.imposed,
+    )
 
 
 def _body(

@@ -223,12 +223,12 @@ def solve_tangent(
     b: Unknowns,
     held: Array,
     settings: Newton,
-    transposed: bool = False,
+    from_left: bool = False,
     preconditioned: Unknowns | None = None,
 ) -> KrylovResult:
     """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
 
-    In float32, like the tangent. A transposed one is preconditioned from the left: then, too, the Krylov space is
+    In float32, like the tangent. Preconditioned from the left, the Krylov space of a transposed one is, too,
     that of the preconditioned tangent, or its transpose. From the right it would hold moves that press on stiff
     contact, for which the friction of a transposed tangent is a large force. Where the preconditioned scaled b is
     known, it is not computed again.
@@ -246,19 +246,16 @@ def solve_tangent(
         return inside(tangent.apply(v))
 
     def precondition(v):
-        # The hold acts on the window face, but what it prevents is motion of the whole body.
-        x = tangent.precondition(v)
-        return x._replace(u=problem.without_drift(x.u, held))
+        return problem.precondition(tangent, v, held)
 
     start = b
-    if transposed and preconditioned is None:
+    if from_left and preconditioned is None:
         start = precondition(b)
-    elif transposed:
+    elif from_left:
         start = jax.tree.map(lambda part: (part / size).astype(jnp.float32), preconditioned)
-        start = start._replace(u=problem.without_drift(start.u, held))
     result = fgmres(
-        (lambda v: precondition(multiply(v))) if transposed else multiply,
-        (lambda v: v) if transposed else precondition,
+        (lambda v: precondition(multiply(v))) if from_left else multiply,
+        (lambda v: v) if from_left else precondition,
         start,
         settings.krylov_rtol,
         basis=_KRYLOV_BASIS,

@@ -1,15 +1,19 @@
 """From the converged state of a layer and a sample to what users read."""
 
+import dataclasses
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
-from ..mechanics.boundary import take, to_touching
+from ..mechanics.boundary import Bodies, take, to_touching
 from ..mechanics.face import to_corners
-from ..model import Compression, extreme_stretches
+from ..model import Compression, Experiment, extreme_stretches
 from .equations import State
-from .equilibrium import Problem
+from .equilibrium import Forces, Problem
+from .experiment import single_bodies
 from .recover import at_nodes, deformed_thickness, face_result, per_area
 from .solution import BodyResult, FaceResult
 from .stack import Stack, parts
@@ -27,21 +31,36 @@ class ExperimentFields(eqx.Module):
     stats: dict[str, Array]
 
 
-def recover_experiment(problem: Stack, before: State, state: State, load: Compression) -> ExperimentFields:
+class _Single(NamedTuple):
+    """One body: its problem, the state its last increment started from, the last one, and its forces, all there."""
+
+    problem: Problem
+    before: State
+    state: State
+    forces: Forces
+
+
+def recover_experiment(
+    problem: Stack | Problem, before: State, state: State, experiment: Experiment, load: Compression
+) -> ExperimentFields:
     """Recover the fields of a state, given the one its last increment started from."""
-    forces = problem.forces(state.unknowns, state.fraction, before)
-    lower, upper = (body.reactions(f) for body, f in zip(problem.bodies, forces.bodies, strict=True))
-    layer, sample = problem.bodies
-    (low_before, up_before), (low, up) = parts(before), parts(state)
+    if isinstance(problem, Stack):
+        bodies, hold = _of_stack(problem, before, state)
+    else:
+        bodies, hold = _of_block(problem, before, state, experiment, load)
+    (layer, low_before, low, lower), (sample, up_before, up, upper) = bodies
     window, window_stats = face_result(
         layer, "window", layer.supports.window, low_before, low, lower.applied.window.face
     )
     plate, plate_stats = face_result(
         sample, "sample", sample.supports.interface, up_before, up, upper.applied.sample.face
     )
-    interface, pair_stats = _interface(problem, before, state, lower.applied.sample.face)
-    histories = [h for body in state.histories[:2] for h in body if h is not None] + [state.histories[2]]
-    hold = [body.hold_force(f, state.held) for body, f in zip(problem.bodies, (lower, upper), strict=True)]
+    histories = [h for h in (*low.histories, *up.histories) if h is not None]
+    if isinstance(problem, Stack):
+        interface, pair_stats = _interface(problem, before, state, lower.applied.sample.face)
+        histories.append(state.histories[2])
+    else:
+        interface, pair_stats = face_result(layer, "sample", "bonded", low_before, low, lower.applied.sample.face)
     u = low.u
     stats = {
         "force_sample": lower.applied.sample.total,
@@ -54,7 +73,7 @@ def recover_experiment(problem: Stack, before: State, state: State, load: Compre
         "friction_dissipation": sum((h.dissipated for h in histories), start=jnp.zeros((), u.dtype)),
         "approach": pair_stats["approach"],
         "max_penetration": jnp.stack([s["max_penetration"] for s in (window_stats, pair_stats, plate_stats)]).max(),
-        "min_volume_ratio": forces.smallest_J,
+        "min_volume_ratio": jnp.minimum(lower.smallest_J, upper.smallest_J),
     }
     # The layer's own thickness: contact with the window may leave a gap.
     own = u[:, -1] - jnp.concatenate([jnp.zeros_like(u[:2, 0]), u[2:, 0]])
@@ -67,6 +86,44 @@ def recover_experiment(problem: Stack, before: State, state: State, load: Compre
         thickness=deformed_thickness(layer.positions[:, -1], own, load),
         stats=stats,
     )
+
+
+def _of_stack(problem: Stack, before: State, state: State) -> tuple[list[_Single], list[Array]]:
+    """Take a stack apart: its bodies, and the hold's force on each."""
+    of_bodies = problem.forces(state.unknowns, state.fraction, before).bodies
+    forces = [body.reactions(f) for body, f in zip(problem.bodies, of_bodies, strict=True)]
+    holds = zip(problem.bodies, forces, problem.holds(state.held), strict=True)
+    singles = zip(problem.bodies, parts(before), parts(state), forces, strict=True)
+    return [_Single(*single) for single in singles], [body.hold_force(f, held) for body, f, held in holds]
+
+
+def _of_block(
+    block: Problem, before: State, state: State, experiment: Experiment, load: Compression
+) -> tuple[list[_Single], list[Array]]:
+    """Cut a block at its interface: the bodies, each with the force that the other one's nodes there exert."""
+    hold = block.hold_force(block.reactions(block.forces(state.unknowns, state.fraction, before)), state.held)
+    contacts = Bodies(block.contacts.window, None), Bodies(None, block.contacts.sample)
+    nz = experiment.layer_elements[2]
+    singles = []
+    # Neither rule nor start matters: contacts are those of the block.
+    for own, body, nodes, elements in zip(
+        contacts,
+        single_bodies(experiment, load, None, "gauss2"),
+        (slice(None, nz + 1), slice(nz, None)),
+        (slice(None, nz), slice(nz, None)),
+        strict=True,
+    ):
+        single = dataclasses.replace(body, contacts=own, viscosity=block.viscosity, spring=None)
+        at, last = (_cut(s, own, nodes, elements) for s in (before, state))
+        singles.append(_Single(single, at, last, single.reactions(single.forces(last.unknowns, last.fraction, at))))
+    return singles, [hold]
+
+
+def _cut(state: State, contacts: Bodies, nodes: slice, elements: slice) -> State:
+    """Take one body's part of the state of a block."""
+    stress = None if state.mean_stress is None else state.mean_stress[elements]
+    histories = contacts.map(lambda _, __, history: history, state.histories)
+    return dataclasses.replace(state, u=state.u[:, nodes], mean_stress=stress, histories=histories)
 
 
 def _result(problem: Problem, state: State) -> BodyResult:

@@ -15,7 +15,7 @@ from .compiling import QuickJit, compiled_meanwhile, is_traced
 from .derivative import follow_path
 from .discretise import check_compatible, discretise
 from .equations import AbstractProblem, State
-from .experiment import discretise_experiment
+from .experiment import discretise_experiment, touching
 from .explicit import Explicit, solve_explicit
 from .newton import Newton
 from .progress import Progress
@@ -95,7 +95,6 @@ def solve(
         `beyond_calibration` [-]: by how much of themselves stretches left those of the tests, 0 if
         they did not. Of an experiment `force_sample`
         is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
-        Derivatives of an experiment are NaN for now: their linear systems do not converge.
 
     Raises:
         ValueError: If load and palpation contradict each other, or numbers are float32.
@@ -151,7 +150,9 @@ def prepare(palpation, load, load_start, solver, state: State | None, traced: bo
     initial = problem.initial_state()
     if state is None:
         stepping = begin(initial, solver, traced)
-        return problem, stepping._replace(before=problem.touching(initial, stepping.increment))
+        if isinstance(palpation, Experiment):
+            stepping = stepping._replace(before=touching(problem, initial, stepping.increment))
+        return problem, stepping
     if jax.tree.structure(state) != jax.tree.structure(initial):
         raise ValueError(
             "A solve continues on the same faces, with the same kind of load: start has other contact, friction or "
@@ -255,7 +256,7 @@ def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
 
 
 def _finish_experiment(problem, s: Stepping, experiment, load, counts, kept, last) -> ExperimentSolution:
-    fields = recover_experiment(problem, s.before, s.state, load)
+    fields = recover_experiment(problem, s.before, s.state, experiment, load)
     fields = eqx.tree_at(lambda f: f.thickness.values, fields, kept(fields.thickness.values))
     layer, sample, window, interface, plate, stats = jax.tree.map(
         kept, (fields.layer, fields.sample, fields.window, fields.interface, fields.plate, fields.stats)

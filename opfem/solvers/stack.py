@@ -6,7 +6,7 @@ through both bodies would be spoilt as soon as the bodies slide.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,10 +19,6 @@ from .equations import AbstractProblem, HoldBalance, State
 from .equilibrium import Forces, Problem, single
 from .stencil import Nodal
 from .tangent import Tangent, Unknowns
-
-# A first guess closes every contact to this share of the lower body's shear modulus: enough for laws that start without
-# stiffness to have some, too little to deform anything.
-_TOUCH = 1e-3
 
 # V-cycles of the lower body for one of the upper one. What is left of stiff contact after one would count against the
 # upper body's soft springs: on 12×12×(2+6) elements with the exponential law and friction 0.05, one, three with
@@ -67,6 +63,7 @@ class Stack(AbstractProblem):
     upper: Problem
     pair: ContactPair
     viscosity: Array
+    left_transpose: ClassVar[bool] = False
 
     @property
     def bodies(self) -> tuple[Problem, Problem]:
@@ -93,6 +90,17 @@ class Stack(AbstractProblem):
     def stress_scale(self) -> Array:
         """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]; times volume, a force."""
         return self.lower.stress_scale
+
+    def holds(self, held: Array) -> tuple[Array, Array]:
+        """Tell whether rigid motion of each body is held, given whether friction between them has not taken over.
+
+        Friction between the bodies never holds both: without any at window and plate the lower one stays held.
+        """
+        if self.lower.drift_modes is None or self.upper.drift_modes is None:
+            return held, held
+        ends = [face for face in (self.lower.contacts.window, self.upper.contacts.sample) if face is not None]
+        rubs = [face.own_contact.friction > 0 for face in ends]
+        return held | ~jnp.any(jnp.stack([jnp.asarray(False), *rubs])), held
 
     def own_forces(self, x: Unknowns, state: State) -> StackForces:
         """Compute the forces of bodies, medium and springs [N], none applied."""
@@ -151,16 +159,18 @@ class Stack(AbstractProblem):
 
     def residual(self, forces: StackForces, held: Array) -> Unknowns:
         """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
-        rest = [body.residual(f, held) for body, f in zip(self.bodies, forces.bodies, strict=True)]
+        rest = [
+            body.residual(f, own) for body, f, own in zip(self.bodies, forces.bodies, self.holds(held), strict=True)
+        ]
         return Unknowns(tuple(r.u for r in rest), tuple(r.mean_stress for r in rest))
 
     def project(self, r: PyTree, held: Array) -> PyTree:
         """Take the held rigid motions of each body out of nodal fields."""
-        return tuple(body.project(v, held) for body, v in zip(self.bodies, r, strict=True))
+        return tuple(body.project(v, own) for body, v, own in zip(self.bodies, r, self.holds(held), strict=True))
 
     def without_drift(self, u: PyTree, held: Array) -> PyTree:
         """Move each body as a whole so that its lower face has none of the held rigid motions."""
-        return tuple(body.without_drift(v, held) for body, v in zip(self.bodies, u, strict=True))
+        return tuple(body.without_drift(v, own) for body, v, own in zip(self.bodies, u, self.holds(held), strict=True))
 
     def limited(self, change: PyTree, step_limit: float | int | Array) -> PyTree:
         """Shorten the moves of single nodes that stand out of a step."""
@@ -228,26 +238,42 @@ class Stack(AbstractProblem):
                 self._each(x, state), laws[:2], points[:2], ("sample", "window"), (full, soft), strict=True
             )
         ]
-        return StackTangent((own[0], own[1]), between, transposed, self.upper.elements)
+        return StackTangent((own[0], own[1]), between, transposed)
+
+    def precondition(self, tangent: "StackTangent", r: Unknowns, held: Array) -> Unknowns:
+        """Solve the lower body, then the upper one with what that pushes; the other way round where transposed.
+
+        Held rigid motions are taken out body by body: one body's would press on the other.
+        """
+        lower, upper = _split(jax.tree.map(lambda part: part.astype(jnp.float32), r))
+        holds_lower, holds_upper = self.holds(held)
+
+        if tangent.is_transposed:
+            above = self.upper.precondition(tangent.bodies[1], upper, holds_upper)
+            push = tangent.push(jnp.zeros_like(lower.u), above.u)[0]
+            lower = lower._replace(u=self.lower.project(lower.u + push, holds_lower))
+            return _together([self._solve_lower(tangent, lower, holds_lower), above])
+        below = self._solve_lower(tangent, lower, holds_lower)
+        push = tangent.push(below.u, jnp.zeros_like(upper.u))[1]
+        upper = upper._replace(u=self.upper.project(upper.u + push, holds_upper))
+        return _together([below, self.upper.precondition(tangent.bodies[1], upper, holds_upper)])
+
+    def _solve_lower(self, tangent: "StackTangent", r: Unknowns, held: Array) -> Unknowns:
+        """Solve the lower body against a fixed upper one, friction's coupling included, by V-cycles."""
+        body, still = tangent.bodies[0], jnp.zeros(self.upper.positions.shape, jnp.float32)
+
+        def improve(_, x):
+            rest = jax.tree.map(jnp.subtract, r, body.apply(x))
+            rest = rest._replace(u=self.lower.project(rest.u + tangent.push(x.u, still)[0], held))
+            return jax.tree.map(jnp.add, x, self.lower.precondition(body, rest, held))
+
+        return jax.lax.fori_loop(0, _LOWER_CYCLES, improve, jax.tree.map(jnp.zeros_like, r))
 
     def initial_state(self) -> State:
         """Build the undeformed state at load fraction zero."""
         corners = take(self.lower.positions, "sample", with_sides=False)
         own = [body.initial_state() for body in self.bodies]
         return joined(own, self.pair.initial_history(corners))
-
-    def touching(self, state: State, increment: Array) -> State:
-        """Build the state before an undeformed one from which an increment extrapolates to touching bodies."""
-        pressure = _TOUCH * self.lower.body.shear
-        shift = jnp.zeros((), state.fraction.dtype)
-        window, pair = self.lower.contacts.window, self.pair.face
-        before = []
-        for face, u in zip((window, pair), state.u, strict=True):
-            if face is not None:
-                law = face.own_contact.law
-                shift = shift + law.zero_pressure_clearance - law.clearance_at(pressure, face.stiffness)
-            before.append(jnp.concatenate([u[:2], u[2:] + shift / increment]))
-        return eqx.tree_at(lambda s: [s.u, s.fraction], state, [tuple(before), state.fraction - 1.0])
 
     def _each(self, x: Unknowns, state: State) -> list[tuple[Problem, Unknowns, State]]:
         """Go through the bodies, what is unknown of each, and its own state."""
@@ -262,51 +288,26 @@ class Stack(AbstractProblem):
 
 
 class StackTangent(NamedTuple):
-    """The linear operator of one Newton step of a stack, in float32, and its preconditioner.
+    """The linear operator of one Newton step of a stack, in float32, and the parts of its preconditioner.
 
     Attributes:
         bodies: Of each body alone, lower first; the springs of contact between them only in their preconditioners.
         between: Change of the forces of contact between them by the motion of the lower face's corners and of the upper
             face's nodes; transposed where the operator is.
         is_transposed: Whether it is.
-        upper_elements: Elements (nz, ny, nx) of the upper body.
     """
 
     bodies: tuple[Tangent, Tangent]
     between: Callable[[Array, Array], PairForce]
     is_transposed: bool
-    upper_elements: tuple[int, int, int]
 
     def apply(self, x: Unknowns) -> Unknowns:
         """Multiply with unknowns."""
         own = [body.apply(v) for body, v in zip(self.bodies, _split(x), strict=True)]
-        pushed = self._between(x.u[0], x.u[1])
+        pushed = self.push(x.u[0], x.u[1])
         return _together([f._replace(u=f.u - push) for f, push in zip(own, pushed, strict=True)])
 
-    def precondition(self, r: Unknowns) -> Unknowns:
-        """Solve the lower body, then the upper one with what that pushes; the other way round where transposed."""
-        lower, upper = _split(r)
-        if self.is_transposed:
-            above = self.bodies[1].precondition(upper)
-            pushed = self._between(jnp.zeros_like(lower.u, jnp.float32), above.u)[0]
-            return _together([self._solve_lower(lower._replace(u=lower.u + pushed)), above])
-        below = self._solve_lower(lower)
-        pushed = self._between(below.u, jnp.zeros_like(upper.u, jnp.float32))[1]
-        return _together([below, self.bodies[1].precondition(upper._replace(u=upper.u + pushed))])
-
-    def _solve_lower(self, r: Unknowns) -> Unknowns:
-        """Solve the lower body against a fixed upper one, friction's coupling included, by V-cycles."""
-        body, r = self.bodies[0], jax.tree.map(lambda part: part.astype(jnp.float32), r)
-        still = jnp.zeros((3, *(n + 1 for n in self.upper_elements)), jnp.float32)
-
-        def improve(_, x):
-            own = body.apply(x)
-            rest = own._replace(u=own.u - self._between(x.u, still)[0])
-            return jax.tree.map(jnp.add, x, body.precondition(jax.tree.map(jnp.subtract, r, rest)))
-
-        return jax.lax.fori_loop(0, _LOWER_CYCLES, improve, jax.tree.map(jnp.zeros_like, r))
-
-    def _between(self, lower: Nodal, upper: UpperNodal) -> tuple[Nodal, UpperNodal]:
+    def push(self, lower: Nodal, upper: UpperNodal) -> tuple[Nodal, UpperNodal]:
         """Compute how forces of contact between the bodies change with their motion."""
         lower, upper = (_inside(v, body) for v, body in zip((lower, upper), self.bodies, strict=True))
         force = self.between(take(lower, "sample", with_sides=False), upper[:, 0])

@@ -41,14 +41,10 @@ class Unknowns(NamedTuple):
 
 @runtime_checkable
 class AbstractTangent(Protocol):
-    """The linear operator of one Newton step, in float32, and its preconditioner."""
+    """The linear operator of one Newton step, in float32."""
 
     def apply(self, x: Unknowns) -> Unknowns:
         """Multiply with unknowns."""
-        ...
-
-    def precondition(self, r: Unknowns) -> Unknowns:
-        """Approximate the solution."""
         ...
 
 
