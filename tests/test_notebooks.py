@@ -10,10 +10,22 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 # What each prints, as patterns.
 PRINTED = {
+    "calibration": [
+        r"mooney_rivlin  E0 = 18\.[12]\d kPa",
+        r"without offset: E0 = 16\.\d\d kPa",
+        r"E0 known to 1\.\d%, C01 to \d\d%",
+        r"0\.35 mm: stretches leave the test by [1-9]",
+    ],
     "explicit": [
         r"explicit: force 0\.\d+ N",
         r"pressure inside: difference 0\.\d\d%",
         r"kinetic 0\.\d\d%, missing 0\.\d+%",
+    ],
+    "friction": [
+        r"displacement: bias [+-]0\.\d\d nm, rms [0-2]\.\d\d nm",
+        r"window\.friction: 0\.(19|20|21)\d ± 0\.0[0-3]\d",
+        r"sample\.friction: 0\.0[6-9]\d ± 0\.0[0-4]\d",
+        r"pressure: known to \d\.\d%",
     ],
     "oct": [
         r"interface: bias [+-]0\.[0-3]\d µm, rms 0\.\d\d µm",
