@@ -21,12 +21,6 @@ PRINTED = {
         r"pressure inside: difference 0\.\d\d%",
         r"kinetic 0\.\d\d%, missing 0\.\d+%",
     ],
-    "friction": [
-        r"displacement: bias [+-]0\.\d\d nm, rms [0-2]\.\d\d nm",
-        r"window\.friction: 0\.(19|20|21)\d ± 0\.0[0-3]\d",
-        r"sample\.friction: 0\.0[6-9]\d ± 0\.0[0-4]\d",
-        r"pressure: known to \d\.\d%",
-    ],
     "oct": [
         r"interface: bias [+-]0\.[0-3]\d µm, rms 0\.\d\d µm",
         r"its std: 9[0-8]% of pixels within two",

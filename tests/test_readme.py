@@ -71,28 +71,6 @@ def test_calibration(own_map):
 
 
 @pytest.mark.slow
-def test_displacement_and_frictions(own_map):
-    measured = blocks("python")[5]
-    hard = op.HardOverclosure()
-    layer = op.Layer(0.5, op.MooneyRivlin(2.23e-3, 7.03e-4, bulk=0.11732))
-    palpation, truth = (
-        op.Palpation(layer, (2.0, 2.0), (8, 8, 2), window=op.Contact(hard, w), sample=op.Contact(hard, s))
-        for w, s in ((0.15, 0.05), (0.2, 0.08))
-    )
-    loads = [op.Imprint(op.ThicknessMap(np.full((5, 5), h), extent=(2.0, 2.0))) for h in (0.45, 0.449)]
-    first = op.solve(truth, loads[0])
-    scene = op.oct_scene(op.solve(truth, loads[1], start=first), before=first)
-    volumes = op.simulate_oct(
-        op.UWA_845NM, scene.surface, key=jax.random.key(0), spacing=(0.02, 0.02), shape=(101, 101), depth=0.44,
-        increment=scene.increment, media=(op.Medium(0.0, 0.5), op.SAMPLE),
-    )  # fmt: skip
-    names = {"op": op, "palpation": palpation, "force": -float(first.stats["force_sample"][2])}
-    names |= dict(zip(("preload", "actuation", "before", "after"), (*loads, *volumes), strict=True))
-    exec(compile(measured, "README.md", "exec"), names)
-    assert abs(float(names["fit"].numbers["window.friction"]) - 0.2) < 0.04
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_virtual_experiment(own_map):
     _, code, _, virtual, *_ = blocks("python")
