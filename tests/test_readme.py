@@ -35,7 +35,7 @@ def own_map(tmp_path, monkeypatch):
 
 
 def test_python(own_map):
-    found, code, _, _, swept = blocks("python")
+    found, code, _, _, _, _, swept = blocks("python")
     names = {"op": op}
     exec(compile(found, "README.md", "exec"), names)
     assert float(names["loaded"].std.max()) < 0.01
@@ -51,7 +51,7 @@ def test_python(own_map):
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_fit(own_map):
-    _, code, fitted, _, _ = blocks("python")
+    _, code, fitted, *_ = blocks("python")
     assert "(40, 40, 4)" in code  # which takes minutes on 2 cores
     names = {}
     exec(compile(code.replace("(40, 40, 4)", "(20, 20, 2)") + fitted, "README.md", "exec"), names)
@@ -59,10 +59,21 @@ def test_fit(own_map):
     plt.close("all")
 
 
+def test_calibration(own_map):
+    calibrated = blocks("python")[4]
+    stretch = np.linspace(1.0, 0.7, 40)
+    stress = 2 * (stretch - stretch**-2) * (2.23 + 0.703 / stretch)
+    np.savetxt("compression.csv", np.stack([100 * (1 - stretch), stress], axis=1), delimiter=",")
+    names = {"op": op}
+    exec(compile(calibrated, "README.md", "exec"), names)
+    assert float(names["found"].modulus) == pytest.approx(9 * 20 * 2 * 2.933e-3 / 61, rel=0.02)
+    plt.close("all")
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_virtual_experiment(own_map):
-    _, code, _, virtual, _ = blocks("python")
+    _, code, _, virtual, *_ = blocks("python")
     names = {}
     exec(compile(code.replace("(40, 40, 4)", "(16, 16, 2)") + virtual, "README.md", "exec"), names)
     assert 0.25 < names["compared"].relative_error < 0.42  # "a third": what README says, not an error of the solver
@@ -73,7 +84,7 @@ def test_virtual_experiment(own_map):
 def test_scene_states_the_same_experiment(own_map):
     scene, _ = blocks("toml")
     Path("scene.toml").write_text(scene, encoding="utf-8")
-    _, code, _, virtual, _ = blocks("python")
+    _, code, _, virtual, *_ = blocks("python")
     names = {}
     exec(compile(code.split("data =")[0] + virtual.split("truth =")[0], "README.md", "exec"), names)
     assert repr(read_scene(Path("scene.toml")).experiment) == repr(names["experiment"])

@@ -281,7 +281,7 @@ def _settle(run: _Run, bed: Bed | None, given: Unknowns | None) -> _Reached:
     return reached
 
 
-def _allowing_for_the_mesh(run: _Run, reached: _Reached, maps: Sequence[ThicknessMap]) -> _Reached:
+def _allowing_for_the_mesh(run: _Run, reached: _Reached, maps: tuple[ThicknessMap, ...]) -> _Reached:
     """Go on with what the mesh misses counted as noise; as it was where that cannot be estimated."""
     misfit = run.misfit
     if not can_halve(misfit.palpation.elements):

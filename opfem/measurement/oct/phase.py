@@ -107,19 +107,19 @@ def axial_displacement(
         a, b = (np.asarray(volume.values[top:bottom]).astype(np.complex64) for volume in (before, after))
         b = _shifted(b, shifts[top:bottom])
         if isinstance(reference, Interface):
-            b = b * np.exp(-1j * _window_phase(a, b, reference, top, system, dz))[..., None].astype(np.complex64)
+            b = b * np.exp(-1j * _window_phase(a, b, reference, top, system, depth))[..., None].astype(np.complex64)
         part = _followed(a, b, plan)
         inner = slice(first - top, min(first + count, ny) - top)
         u[first : first + count], coherence[first : first + count] = (field[inner] for field in part[:2])
         noise[first : first + count] = part[2][inner]
     u, consistent = _consistent(u, abs(2.0 * math.pi / plan.radians))
     mask = (coherence < min_coherence) | ~consistent
-    mask[..., : plan.first] = True
+    above = np.broadcast_to(np.arange(nz) >= plan.first, mask.shape)
     if interface is not None:
         surface = np.asarray(interface.depth if isinstance(interface, Interface) else interface, float)
-        mask |= depth >= surface[..., None]
-    counted = coherence[..., plan.first :] if interface is None else coherence[~mask | (depth < surface[..., None])]
-    _check_coherence(float(np.median(counted)), a, b, dz)
+        above = above & (depth < surface[..., None])
+    mask |= ~above
+    _check_coherence(float(np.median(coherence[above])), a, b, dz)
     std, shared = _std(u, coherence, noise, plan, before.spacing, system, dz)
     return DisplacementVolume(
         values=np.where(mask, np.float32(0), np.float32(dz) * u),
@@ -258,10 +258,11 @@ def _carried(b: np.ndarray, u: np.ndarray) -> np.ndarray:
     return total
 
 
-def _window_phase(a, b, reference: Interface, top: int, system: OctSystem, dz: float) -> np.ndarray:
+def _window_phase(a, b, reference: Interface, top: int, system: OctSystem, levels: np.ndarray) -> np.ndarray:
     """Phase [rad] of each A-line's product over one axial FWHM to both sides of the window."""
     depth = np.asarray(reference.depth)[top : top + a.shape[0]]
-    place = np.clip(np.round(depth / dz).astype(int), 0, a.shape[2] - 1)
+    dz = levels[1] - levels[0]
+    place = np.clip(np.round((depth - levels[0]) / dz).astype(int), 0, a.shape[2] - 1)
     half = max(1, round(float(system.axial_fwhm) / dz))
     index = np.clip(place[..., None] + np.arange(-half, half + 1), 0, a.shape[2] - 1)
     return np.angle((np.take_along_axis(b, index, 2) * np.take_along_axis(a, index, 2).conj()).sum(axis=2))
@@ -269,8 +270,7 @@ def _window_phase(a, b, reference: Interface, top: int, system: OctSystem, dz: f
 
 def _bulk_phase(product: np.ndarray, plan: _Plan) -> np.ndarray:
     """Extrapolate the phase of each B-scan to the window [rad]: a parabola over the first depths."""
-    dz = abs(plan.first)
-    last = max(plan.first + 8, round(_BULK / _FIRST * dz))
+    last = max(plan.first + 8, round(_BULK / _FIRST * plan.first))
     phase = np.unwrap(np.angle(product.sum(axis=1)[:, plan.first : last]), axis=1)
     z = np.arange(plan.first, plan.first + phase.shape[1])
     return np.polynomial.polynomial.polyfit(z, phase.T, 2)[0]
