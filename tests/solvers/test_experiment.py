@@ -12,7 +12,7 @@ import pytest
 import opfem as op
 from opfem.solvers.derivative import _solve
 from opfem.solvers.experiment import discretise_experiment
-from tests.tolerances import OTHER_CODE
+from tests.tolerances import OTHER_CODE, ROUNDOFF
 
 SOFT = op.MooneyRivlin(c10=0.00223, c01=0.000703, bulk=0.11732)  # MPa, of the references
 PENALTY = 2.0  # MPa/mm
@@ -34,6 +34,9 @@ def stack(ratio=1.0, sides="roller", elements=(3, 3, (2, 3)), friction=0.0, laye
         plate=op.Roller(),
         sides=sides,
     )
+
+
+FRICTIONAL = stack(2.0, sides="free", elements=(3, 2, (1, 2)), friction=0.1), op.Compression(0.2)
 
 
 def confined_stress(strain, material):
@@ -73,6 +76,17 @@ def test_action_is_reaction(confined):
     total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
     assert np.abs(total).max() < 1e-6 * np.abs(stats["force_window"]).max()
     np.testing.assert_allclose(stats["force_plate"][2], stats["force_sample"][2], rtol=1e-6)
+
+
+def test_forces_between_bodies_are_equal_and_opposite_to_rounding():
+    problem = discretise_experiment(*FRICTIONAL, None, "gauss2")
+    state = problem.initial_state()
+    move = np.array([1e-3, 0.0, -2e-3])[:, None, None, None]  # mm
+    x = state.unknowns._replace(u=(state.u[0], state.u[1] + move))
+    lower, upper = jax.jit(lambda x: problem.forces(x, jnp.ones(()), state).bodies)(x)
+    on_layer, on_sample = lower.applied.sample.total, upper.applied.window.total
+    assert np.abs(on_layer[0]) > 1e-2 * np.abs(on_layer[2]) > 0
+    np.testing.assert_allclose(on_layer, -on_sample, rtol=0, atol=ROUNDOFF * np.abs(on_layer[2]))
 
 
 def test_bonded_stack_of_one_material_is_one_block():
