@@ -15,6 +15,7 @@ PRINTED = {
         r"phase from -\d\d\.\d to -?\d+\.\d rad",
         r"CalculiX has no element|CalculiX cannot say",
         r"round trip: equal for calculix",
+    ],
     "calibration": [
         r"mooney_rivlin  E0 = 18\.[12]\d kPa",
         r"without offset: E0 = 16\.\d\d kPa",

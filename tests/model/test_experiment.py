@@ -135,6 +135,7 @@ def test_arguments_are_kept():
         ({"sample": op.Sample(1.0, SOFT, levels=(0.0, 1.0))}, r"must be nz\+1 = 5 numbers"),
         ({"elements": ((8, 8, 2), (13, 8, 4))}, r"too coarse for contact, 8 × 8 elements against 13 × 8"),
         ({"elements": ((8, 8, 2), (8, 10, 4)), "interface": op.Bonded()}, r"the same nx and ny in layer and sample"),
+        ({"element": ("full", "hybrid"), "interface": op.Bonded()}, r"element must be the same for both, got \('full'"),
         ({"sample": op.Sample(ridged(), SOFT), "interface": op.Bonded()}, r"lies up to 0\.1\d+ mm off the layer's"),
         (
             {"sample": SAMPLE.with_inclusion(op.Sphere((1.0, 5.0, 0.5), 0.3), HARD)},

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import opfem as op
-from tests.tolerances import OTHER_CODE
+from opfem.solvers.derivative import _solve
+from opfem.solvers.experiment import discretise_experiment
+from tests.tolerances import OTHER_CODE, ROUNDOFF
 
 SOFT = op.MooneyRivlin(c10=0.00223, c01=0.000703, bulk=0.11732)  # MPa, of the references
 PENALTY = 2.0  # MPa/mm
@@ -32,6 +34,9 @@ def stack(ratio=1.0, sides="roller", elements=(3, 3, (2, 3)), friction=0.0, laye
         plate=op.Roller(),
         sides=sides,
     )
+
+
+FRICTIONAL = stack(2.0, sides="free", elements=(3, 2, (1, 2)), friction=0.1), op.Compression(0.2)
 
 
 def confined_stress(strain, material):
@@ -71,6 +76,17 @@ def test_action_is_reaction(confined):
     total = stats["force_sample"] + stats["force_window"] + stats["force_hold"]
     assert np.abs(total).max() < 1e-6 * np.abs(stats["force_window"]).max()
     np.testing.assert_allclose(stats["force_plate"][2], stats["force_sample"][2], rtol=1e-6)
+
+
+def test_forces_between_bodies_are_equal_and_opposite_to_rounding():
+    problem = discretise_experiment(*FRICTIONAL, None, "gauss2")
+    state = problem.initial_state()
+    move = np.array([1e-3, 0.0, -2e-3])[:, None, None, None]  # mm
+    x = state.unknowns._replace(u=(state.u[0], state.u[1] + move))
+    lower, upper = jax.jit(lambda x: problem.forces(x, jnp.ones(()), state).bodies)(x)
+    on_layer, on_sample = lower.applied.sample.total, upper.applied.window.total
+    assert np.abs(on_layer[0]) > 1e-2 * np.abs(on_layer[2]) > 0
+    np.testing.assert_allclose(on_layer, -on_sample, rtol=0, atol=ROUNDOFF * np.abs(on_layer[2]))
 
 
 def test_bonded_stack_of_one_material_is_one_block():
@@ -129,7 +145,8 @@ def pressed_inclusion(numbers, elements, exponential):
         interface=contact(PENALTY, numbers["interface_friction"]),
         plate=end,
     )
-    return op.solve(experiment, op.Compression(numbers["approach"]), op.Newton(rtol=1e-11, increments=4))
+    # Programs that may raise are not kept on disk.
+    return op.solve(experiment, op.Compression(numbers["approach"]), op.Newton(rtol=1e-11, increments=4), throw=False)
 
 
 @partial(jax.jit, static_argnums=(2, 3), compiler_options=op.compiler_options())
@@ -156,6 +173,7 @@ def assert_derivatives_agree(name, **case):
     np.testing.assert_allclose((ends[0] - ends[1]) / 2e-4, forward, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NUMBERS)
 def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
     assert_derivatives_agree(name)
@@ -165,6 +183,39 @@ def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
 @pytest.mark.parametrize("name", NUMBERS)
 def test_derivatives_of_a_finer_experiment_with_the_exponential_law(name):
     assert_derivatives_agree(name, elements=(8, 8, (2, 4)), exponential=True)
+
+
+@jax.jit
+def forward_and_transposed(problem, x, held, b, c):
+    """Solve the linear systems of a derivative, forward with b and transposed with c."""
+    state, full = problem.initial_state(), jnp.ones(())
+    settings = dataclasses.replace(op.Newton().as_leaves(), krylov_rtol=jnp.asarray(1e-5))
+
+    def balance(x):
+        return problem.balance(x, full, state, held)
+
+    def solved(transposed, product, right):
+        tangent = problem.tangent(x, full, state, None, transposed)
+        return _solve(problem, tangent, False, held, product, right, jnp.asarray(True), settings)
+
+    across = jax.vjp(balance, x)[1]
+    return solved(False, lambda v: jax.jvp(balance, (x,), (v,))[1], b), solved(True, lambda v: across(v)[0], c)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1])
+def test_linear_systems_of_a_stack_that_nothing_rigid_holds_are_solved_forward_and_transposed(friction):
+    """Between frictionless ends, by the hold of both bodies, and of the lower one once the other rubs on it."""
+    experiment = stack(2.0, sides="free", elements=(3, 2, (1, 2)), friction=friction)
+    problem = discretise_experiment(experiment, op.Compression(0.2), None, "gauss2")
+    start = problem.initial_state().unknowns
+    moves = (np.array([0.0, 0.0, 0.0]), np.array([1e-3, 0.0, -2e-3]))  # mm: a pressure of 4 kPa, sticking and sliding
+    x = start._replace(u=tuple(u + move[:, None, None, None] for u, move in zip(start.u, moves, strict=True)))
+    rng = np.random.default_rng(0)
+    b, c = (jax.tree.map(lambda v: jnp.asarray(rng.standard_normal(v.shape)), x) for _ in range(2))
+    forward, transposed = forward_and_transposed(problem, x, jnp.asarray(friction == 0.0), b, c)
+    products = [jax.tree.map(jnp.vdot, *pair) for pair in ((c, forward), (b, transposed))]
+    ours, theirs = (sum(jax.tree.leaves(product)) for product in products)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-8)
 
 
 def law(numbers):
