@@ -122,7 +122,7 @@ class TestRecord:
 
     def test_inputs_in_words(self, dataset):
         assert json.loads(dataset.attrs["layer"])["material"] == {
-            "class": "MooneyRivlin", "c10": 2.23e-3, "c01": 7.03e-4, "bulk": 0.11732,
+            "class": "MooneyRivlin", "c10": 2.23e-3, "c01": 7.03e-4, "bulk": 0.11732, "calibrated": None,
         }  # fmt: skip
         assert json.loads(dataset.attrs["window"])["friction"] == 0.15
         assert json.loads(dataset.attrs["sample"])["law"]["class"] == "ExponentialOverclosure"
