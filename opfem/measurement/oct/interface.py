@@ -172,7 +172,7 @@ def find_interface(
         spacing=volume.spacing,
         origin=volume.origin,
         noise_length=jnp.asarray(found.noise_length, float),
-        index=jnp.asarray(system.index, float),  # of the precision that is asked for now
+        index=jnp.asarray(system.index, float),  # float64 where JAX has it enabled
         steps=(*volume.steps, *steps),
     )
 
