@@ -91,7 +91,9 @@ class Folder:
     def _begun(self) -> Plan | None:
         file = self._folder / PLAN
         if not file.exists():
-            if self._folder.is_dir() and any(self._folder.iterdir()):
+            # Another process may be beginning here: its folder of points and the plan's temporary file come first.
+            begun = (POINTS, PLAN, f".{file.stem}.")
+            if self._folder.is_dir() and not all(found.name.startswith(begun) for found in self._folder.iterdir()):
                 raise ValueError(f"{self._folder} is not empty, and holds no {PLAN}. Choose another out=.")
             return None
         try:
