@@ -23,6 +23,9 @@ class Choices(NamedTuple):
     compiles_slowly: bool
 
 
+# Linux lets a process map 65 530 regions of memory, and jaxlib crashes beyond. A compiled solve takes some 2000.
+_MOST_REGIONS = 30_000
+
 CPU = Choices(bordered=True, one_by_one=True, threads=True, compiles_slowly=True)
 ACCELERATOR = Choices(bordered=False, one_by_one=False, threads=False, compiles_slowly=False)
 
@@ -41,3 +44,14 @@ def memory() -> int | None:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # Windows has none of it
         return None
+
+
+def make_room() -> None:
+    """Forget compiled programs where they are so many that jaxlib would soon crash; what is needed is loaded again."""
+    try:
+        with open("/proc/self/maps", "rb") as maps:
+            regions = sum(1 for _ in maps)
+    except OSError:  # not Linux: no such bound
+        return
+    if regions > _MOST_REGIONS:
+        jax.clear_caches()

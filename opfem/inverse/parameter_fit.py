@@ -14,6 +14,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from .._device import make_room
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
 from ..model import Load, Palpation
@@ -116,7 +117,7 @@ def fit_parameters(
     *,
     scale: AbstractNumberPrior = Normal(1.0, 0.01),
     model_std: float = 0.0,
-    solver: Newton = Newton(),
+    solver: Newton = Newton(rtol=1e-7),
     rtol: float = 1e-3,
     max_steps: int = 30,
     throw: bool = True,
@@ -132,7 +133,7 @@ def fit_parameters(
             "layer.material.bulk", "l0_offset"; or by whatever name the function takes.
         scale: What is known of the factor of increments, fitted as "scale" where there are any.
         model_std: Standard deviation of the increments that the mesh itself computes [mm].
-        solver: Settings of the solves.
+        solver: Settings of the solves; a looser `rtol` moves increments by as much as the phase tells.
         rtol: Change of the white numbers, of a standard deviation, and of χ², at which the fit has settled.
         max_steps: Most steps.
         throw: Whether to raise where the fit does not settle.
@@ -243,6 +244,7 @@ def _least_squares(residuals: Any, white: Array, data: int, rtol: float, max_ste
         done, _ = method.terminate(residuals, white, None, {}, state, frozenset())
         if bool(done):
             return white, step + 1, True
+        make_room()  # every step loads its linearised solves again
     return white, max_steps, False
 
 

@@ -157,7 +157,8 @@ def test_what_is_refused(linear, solution):
 def plates(window, sample, **changes):
     """A layer between two flat plates."""
     layer = op.Layer(0.5, op.MooneyRivlin(2.23e-3, 7.03e-4, bulk=changes.pop("bulk", 0.11732)))
-    hard = op.HardOverclosure()
+    # A penalty: multipliers take one increment more or less, and move the layer by nanometres, as numbers change.
+    hard = op.HardOverclosure(exact=False)
     given = {"extent": (SIDE, SIDE), "elements": (8, 8, 2), **changes}
     return op.Palpation(layer, window=op.Contact(hard, window), sample=op.Contact(hard, sample), **given)
 
@@ -169,7 +170,15 @@ def pressed(thickness):
 LOADS = [pressed(0.45), pressed(0.449)]
 
 
+@pytest.fixture
+def _room_for_programs():
+    """Each step of a fit loads its linearised solves again; with what others left, mapped regions would not suffice."""
+    jax.clear_caches()
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("_room_for_programs")
+@pytest.mark.timeout(1500)
 @pytest.mark.parametrize("frictions", [(0.2, 0.08), (0.1, 0.1)])
 def test_frictions_from_phase_and_force(frictions):
     """Own mesh, 2 nm a block, a scale 0.5 % off: both frictions, bulk modulus and scale; equal frictions too."""
@@ -199,6 +208,8 @@ def test_frictions_from_phase_and_force(frictions):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_room_for_programs")
+@pytest.mark.timeout(1500)
 def test_derivatives_of_increments_against_differences():
     """Through two solves in a row, the second from the first."""
     tight = op.Newton(rtol=1e-10)

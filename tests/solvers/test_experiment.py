@@ -174,12 +174,14 @@ def assert_derivatives_agree(name, **case):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1500)  # its program compiles for minutes
 @pytest.mark.parametrize("name", NUMBERS)
 def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
     assert_derivatives_agree(name)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1500)  # its program compiles for minutes
 @pytest.mark.parametrize("name", NUMBERS)
 def test_derivatives_of_a_finer_experiment_with_the_exponential_law(name):
     assert_derivatives_agree(name, elements=(8, 8, (2, 4)), exponential=True)

@@ -96,10 +96,14 @@ def test_metres_and_pascals_give_the_same_result():
 
 
 @pytest.mark.slow
-def test_ogden_with_exponents_2_and_minus_2_is_mooney_rivlin(frictional):
+def test_ogden_with_exponents_2_and_minus_2_is_mooney_rivlin():
     ogden = op.Ogden(mu=[2 * MATERIAL.c10, 2 * MATERIAL.c01], alpha=[2.0, -2.0], bulk=MATERIAL.bulk)
-    solved = op.solve(published_palpation(material=ogden), op.Imprint(bumpy_map()))
-    np.testing.assert_allclose(solved.pressure, frictional.pressure, rtol=SOLVER, atol=1e-9)
+    accurate = op.Newton(rtol=1e-8)
+    solved, expected = (
+        op.solve(published_palpation(material=law), op.Imprint(bumpy_map()), accurate).pressure
+        for law in (ogden, MATERIAL)
+    )
+    np.testing.assert_allclose(solved, expected, rtol=SOLVER, atol=1e-9)
 
 
 def test_jit_and_vmap_equal_the_eager_loop():
