@@ -52,7 +52,7 @@ def discretise_experiment(
         face=dataclasses.replace(face, stiffness=between),
         spacing=jnp.stack(upper.spacing),
         lower_spacing=jnp.stack(lower.spacing),
-        soft=SOFT * soft.shear,
+        soft=SOFT * _confined(soft) / jnp.mean(lower.thickness) * lower.layers,
         rims=(x0, x1, y0, y1),
     )
     return Stack(lower=layer, upper=sample, pair=pair, viscosity=jnp.zeros((), layer.positions.dtype))
@@ -169,7 +169,12 @@ def _face(
 
 def _stiffness(mesh: LayerMesh | BlockMesh, material: AbstractMaterial) -> Array:
     """Compute the stiffness of an element per area [MPa/mm], the scale of hard contact (`discretise`)."""
-    bulk = jnp.minimum(material.bulk, VOLUME_GUARD * material.shear)
     height = jnp.mean(mesh.thickness) / mesh.layers
     flatness = jnp.minimum(1.0, height / mesh.element_size)
-    return flatness**2 * typical(jnp.asarray(bulk + 4.0 / 3.0 * material.shear)) / height
+    return flatness**2 * _confined(material) / height
+
+
+def _confined(material: AbstractMaterial) -> Array:
+    """Compute the confined modulus [MPa], with no more than `VOLUME_GUARD` shear moduli for the bulk modulus."""
+    bulk = jnp.minimum(material.bulk, VOLUME_GUARD * material.shear)
+    return typical(jnp.asarray(bulk + 4.0 / 3.0 * material.shear))

@@ -42,9 +42,11 @@ _VISCOUS_STEPS = 12
 # Solves of one snap before it is given up.
 _SNAP_SOLVES = 80
 # Gap of hard contact that counts as none, over the size of an element: 1 nm, as well as the phase of OCT tells; and the
-# share of it that an increment at full load must take away to be followed by another.
+# share of it that may be left by an increment at full load that is followed by another. Two lifted corners on 100×100×6
+# elements (`benchmarks/tissue.py lifted`) leave 2.2 µm of penetration at 0.5 and 0.05 µm at 0.9, in 112 and 149 Newton
+# steps: the gap falls to 0.6 of itself each time.
 _NO_GAP = 1e-5
-_LEAST_SETTLING = 0.5
+_LEAST_SETTLING = 0.8
 # A lateral force below this share of the normal one counts as balanced.
 _BALANCED = 1e-4
 
