@@ -26,12 +26,13 @@ from .smooth_face import BEYOND, Place, continued, mirrored, patch
 
 # Newton steps to find the place of a point, from where it would be had the upper face not moved.
 _FINDING_STEPS = 6
-# Most stiffness of the upper body's contact springs in the preconditioner, over that of an element of the lower one (its
-# confined modulus over its height): the lower body is solved with all of its springs, then the upper one with these, as
-# if in series with a seventh of that element. In the other order the upper body's springs would have to be right to a hundredth, and elements' matrices
-# cannot hold those of the smooth surface. Krylov steps a Newton step of the published ridged sample on 20×20×(2+8)
-# elements, at 10, 28, 66 and 85 % of the load: 11, 17, 42 and 64 at 0.02; 12, 15, 18 and 21 at 2; 12, 13, 16 and 18 at
-# 7; 12, 14, 16 and 16 at 23, which needs 13 instead of 9 Newton steps to the first contact.
+# Most stiffness of the upper body's contact springs in the preconditioner, over that of an element of the lower one
+# (its confined modulus over its height): the lower body is solved with all of its springs, then the upper one with
+# these, as if in series with a seventh of that element. In the other order the upper body's springs would have to be
+# right to a hundredth, and elements' matrices cannot hold those of the smooth surface. Krylov steps a Newton step of
+# the published ridged sample on 20×20×(2+8) elements, at 10, 28, 66 and 85 % of the load: 11, 17, 42 and 64 at 0.02;
+# 12, 15, 18 and 21 at 2; 12, 13, 16 and 18 at 7; 12, 14, 16 and 16 at 23, which needs 13 instead of 9 Newton steps to
+# the first contact.
 SOFT = 7.0
 
 UpperNodes = Float[Array, "3 my mx"]
