@@ -112,6 +112,7 @@ from .plot import (
     plot_thickness as plot_thickness,
     plot_uncertainty as plot_uncertainty,
 )
+from .report import write_report as write_report
 from .results import (
     Comparison as Comparison,
     OctScene as OctScene,

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .command_line import remember
 from .curve_options import CurveOptions, LawOptions
 from .deck_options import DeckOptions, WriteOptions
 from .messages import say
@@ -21,6 +22,7 @@ from .options import (
     LayerOptions,
     MapOptions,
     MicroscopeOptions,
+    ReportOptions,
     RunOptions,
     SolverOptions,
     StepOptions,
@@ -64,6 +66,7 @@ def run(tokens: Sequence[str] | None) -> None:
     Args:
         tokens: Arguments; None takes those of the process.
     """
+    remember(tokens)
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except CycloptsError as error:
@@ -82,16 +85,17 @@ def palpate(
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
     deck: WriteOptions = WriteOptions(),
+    report: ReportOptions = ReportOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
 
-    Writes result.nc, result.vtu, summary.json, pressure.png and report.png.
+    Writes result.nc, result.vtu, summary.json, pressure.png, report.png and report.html, which opens in a browser.
     """
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, deck, run)
+        palpate(map, out, reading, layer, contact, solver, deck, run, report.report)
 
 
 @app.command
@@ -105,17 +109,18 @@ def fit(
     contact: ContactOptions = ContactOptions(),
     asked: FitOptions = FitOptions(),
     steps: StepOptions = StepOptions(),
+    report: ReportOptions = ReportOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit the traction on the sample to a measured thickness map, with its uncertainty.
 
     Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
-    summary.json, pressure.png and fit.png.
+    summary.json, pressure.png, fit.png and report.html, which opens in a browser.
     """
     from .fit import fit
 
     with reporting(run.debug):
-        fit(map, out, reading, layer, contact, asked, steps, run)
+        fit(map, out, reading, layer, contact, asked, steps, run, report.report)
 
 
 @app.command
@@ -153,17 +158,18 @@ def simulate(
     *,
     out: _Out,
     deck: WriteOptions = WriteOptions(),
+    report: ReportOptions = ReportOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
 
     Writes map.npz, which palpate and fit take with its noise, result.nc and result.vtu (the truth), summary.json,
-    section.png and report.png; l0.npz where the layer's thickness is a map.
+    section.png, report.png and report.html, which opens in a browser; l0.npz where the layer's thickness is a map.
     """
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, deck, run)
+        simulate(scene, out, deck, run, report.report)
 
 
 @app.command
@@ -176,11 +182,13 @@ def deck(
         bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
     ] = False,
     asked: DeckOptions = DeckOptions(),
+    report: ReportOptions = ReportOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve an Abaqus or CalculiX deck: a soft layer between rigid bodies, or under a soft sample; step by step.
 
-    Writes result.nc, result.vtu, summary.json and pictures of the last step, those of earlier ones in step_1 and so on.
+    Writes result.nc, result.vtu, summary.json, report.html and pictures of the last step, those of earlier ones in
+    step_1 and so on.
     From the second step on, result.nc holds axial_increment, what a phase-sensitive OCT sees between two steps.
     """
     from .deck import solve_deck, state_deck
@@ -191,7 +199,7 @@ def deck(
         elif out is None:
             raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
         else:
-            solve_deck(file, out, asked, run)
+            solve_deck(file, out, asked, run, report.report)
 
 
 @app.command

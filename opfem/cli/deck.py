@@ -21,6 +21,7 @@ from ..solvers.progress import Progress
 from .deck_options import DeckOptions
 from .folder import DECK_PICTURE, prepare, record_failure, settle, write_result
 from .options import RunOptions
+from .record import draw_page, with_record
 from .statement import configure_jax
 
 INCREMENT = "axial_increment"
@@ -128,7 +129,7 @@ def _picture(deck: Deck, bodies: list[Body], loads: tuple[Any, ...]) -> bytes:
     return picture.getvalue()
 
 
-def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> None:
+def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions, report: bool = True) -> None:
     """Solve all steps of a deck and write them, the last one last.
 
     Args:
@@ -136,6 +137,7 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
         out: Folder of the results.
         asked: How it is taken.
         run: The run itself.
+        report: Whether to write report.html.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -162,7 +164,8 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
             record_failure({**summary(failure.solution), "step": step.name, "deck": record, "steps": steps}, out)
             raise ConvergenceError(f"Step {step.name}: {failure}", failure.solution) from None
         numbers = summary(solution)
-        files = _write(solution, before, {**numbers, "step": step.name, "deck": record, "steps": steps}, folder, run)
+        numbers_of_all = {**numbers, "step": step.name, "deck": record, "steps": steps}
+        files = _write(solution, before, numbers_of_all, folder, run, report)
         steps = [*steps, {"step": step.name, **numbers}]
         before = solution
         console.print(_results(step.name, numbers))
@@ -194,6 +197,7 @@ def _write(
     numbers: dict[str, Any],
     folder: Path,
     run: RunOptions,
+    report: bool,
 ) -> list[str]:
     """Write every file of a step; return their names."""
     settle(folder, run.force)
@@ -202,7 +206,7 @@ def _write(
         progress.stage("pictures")
         from ..plot import draw_pictures, draw_simulation
 
-        dataset = to_xarray(solution)
+        dataset = with_record(to_xarray(solution), [], numbers["deck"]["assumed"])
         if before is not None:
             dataset[INCREMENT] = axial_increment(solution, before)
         if isinstance(solution, Solution):
@@ -212,8 +216,9 @@ def _write(
         else:
             spacing = np.asarray(solution.experiment.extent) / solution.experiment.layer_elements[:2]
             figures = draw_simulation(dataset, measured_thickness(solution, spacing))
+        page = draw_page(dataset, None, progress) if report else None
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, folder)
+        return write_result(dataset, figures, numbers, folder, report=page)
 
 
 def axial_increment(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution) -> xr.DataArray:

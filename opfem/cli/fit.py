@@ -17,6 +17,7 @@ from ..solvers import Newton
 from ..solvers.progress import Progress
 from .folder import EXAMPLE, prepare, settle, write_result
 from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions, StepOptions
+from .record import assumed_options, draw_page, with_record
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
 _ELEMENTS_PER_LENGTH = 3.0
@@ -31,6 +32,7 @@ def fit(
     asked: FitOptions,
     steps: StepOptions,
     run: RunOptions,
+    report: bool = True,
 ) -> None:
     """Fit the traction on the sample to a measured thickness map and write it.
 
@@ -43,6 +45,7 @@ def fit(
         asked: The fit.
         steps: How the load is applied.
         run: The run itself.
+        report: Whether to write report.html.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -78,11 +81,12 @@ def fit(
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_fit
 
-        dataset = to_xarray(fitted)
+        dataset = with_record(to_xarray(fitted), assumed_options())
         figures = draw_fit(dataset, measured)
+        page = draw_page(dataset, measured, progress) if report else None
         progress.stage("writing")
         example = {EXAMPLE: measured} if map == "example" else {}
-        files = write_result(dataset, figures, {**numbers, "settings": settings}, out, example)
+        files = write_result(dataset, figures, {**numbers, "settings": settings}, out, example, page)
     _show(numbers, files, out)
 
 

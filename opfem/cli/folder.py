@@ -22,7 +22,8 @@ FINISHED = "result.nc"
 EXAMPLE = "example_map.npz"
 SIMULATED, UNLOADED = "map.npz", "l0.npz"
 DECK_PICTURE = "deck.png"
-_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png", DECK_PICTURE)
+REPORT = "report.html"
+_PICTURES = (REPORT, "pressure.png", "report.png", "fit.png", "section.png", DECK_PICTURE)
 # All that `palpate`, `fit` and `simulate` write.
 RESULT = (EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_PICTURES, "summary.json", FINISHED)
 
@@ -73,6 +74,7 @@ def write_result(
     numbers: dict[str, Any],
     out: Path,
     maps: Mapping[str, ThicknessMap] = MappingProxyType({}),
+    report: bytes | None = None,
 ) -> list[str]:
     """Write every file of a result: all are complete before one of an old result is replaced.
 
@@ -82,6 +84,7 @@ def write_result(
         numbers: For summary.json.
         out: Folder of the results.
         maps: Thickness maps by file name: the built-in one where that was measured, or those that were simulated.
+        report: The page of a report, where one was asked for.
 
     Returns:
         The names of the files.
@@ -92,6 +95,8 @@ def write_result(
         picture = io.BytesIO()
         figure.savefig(picture, dpi=200)
         contents[name] = picture.getvalue()
+    if report is not None:
+        contents[REPORT] = report
     contents["summary.json"] = _json(numbers)
     contents[FINISHED] = netcdf_bytes(dataset)
     write_together(out, contents, RESULT)

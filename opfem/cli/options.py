@@ -363,6 +363,16 @@ class SolverOptions:
 
 @Parameter(name="*", group=Group("Run", sort_key=6))
 @dataclass(frozen=True)
+class ReportOptions:
+    """The page that a result comes with."""
+
+    report: Annotated[
+        bool, Parameter(help="Write report.html, 5 to 8 MB, which any browser opens.", negative="--no-report")
+    ] = True
+
+
+@Parameter(name="*", group=Group("Run", sort_key=6))
+@dataclass(frozen=True)
 class RunOptions:
     """The run itself."""
 

@@ -17,6 +17,7 @@ from .deck_options import WriteOptions
 from .export import export, linear_settings, with_linear_contact
 from .folder import EXAMPLE, FINISHED, prepare, record_failure, settle, write_result
 from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions
+from .record import assumed_options, draw_page, with_record
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
 
@@ -29,6 +30,7 @@ def palpate(
     solver: SolverOptions,
     deck: WriteOptions,
     run: RunOptions,
+    report: bool = True,
 ) -> None:
     """Solve for the stress map of a measured thickness map and write it.
 
@@ -41,6 +43,7 @@ def palpate(
         solver: The solver.
         deck: A deck of the problem, to write too.
         run: The run itself.
+        report: Whether to write report.html.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -61,7 +64,7 @@ def palpate(
             record_failure({**summary(failure.solution), "settings": settings}, out)
             kept = f" {out} keeps its finished result." if (out / FINISHED).exists() else ""
             raise ConvergenceError(f"{failure}{kept}", failure.solution) from None
-        files = write_results(solution, measured, settings, out, is_example=map == "example")
+        files = write_results(solution, measured, settings, out, report, is_example=map == "example")
     _show_results(solution, files, out)
 
 
@@ -80,7 +83,7 @@ def demo(out: Path, coin: bool, solver: SolverOptions, run: RunOptions) -> None:
 
 
 def write_results(
-    solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path, *, is_example: bool
+    solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path, report: bool, *, is_example: bool
 ) -> list[str]:
     """Write every file of a result; return their names.
 
@@ -89,6 +92,7 @@ def write_results(
         measured: Loaded thickness as measured, for the report.
         settings: What the user asked for, for summary.json.
         out: Folder of the results.
+        report: Whether to write report.html.
         is_example: Whether the built-in map was measured, which is written, too.
     """
     with Progress(True, at_once=True) as progress:
@@ -96,11 +100,12 @@ def write_results(
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_pictures
 
-        dataset = to_xarray(solution)
+        dataset = with_record(to_xarray(solution), assumed_options())
         numbers = {**summary(solution), "settings": settings}
         figures = draw_pictures(dataset, measured)
+        page = draw_page(dataset, measured, progress) if report else None
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, out, {EXAMPLE: measured} if is_example else {})
+        return write_result(dataset, figures, numbers, out, {EXAMPLE: measured} if is_example else {}, page)
 
 
 def _solver(options: SolverOptions) -> Newton | Explicit:

@@ -18,11 +18,12 @@ from .deck_options import WriteOptions
 from .export import export, with_linear_contact
 from .folder import FINISHED, SIMULATED, UNLOADED, prepare, record_failure, settle, write_result
 from .options import RunOptions
+from .record import assumed_keys, draw_page, with_record
 from .scene import Scene, in_keys, read_scene
 from .statement import configure_jax
 
 
-def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> None:
+def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions, report: bool = True) -> None:
     """Solve the experiment of a scene, measure it, and write map, truth and pictures.
 
     Args:
@@ -30,6 +31,7 @@ def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> No
         out: Folder of the results.
         deck: A deck of the problem, to write too.
         run: The run itself.
+        report: Whether to write report.html.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -56,13 +58,14 @@ def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> No
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_simulation
 
-        dataset = to_xarray(truth)
+        dataset = with_record(to_xarray(truth), assumed_keys(scene.stated))
         figures = draw_simulation(dataset, measured, scene.section)
         maps = {SIMULATED: measured}
         if isinstance(scene.experiment.layer.thickness, ThicknessMap):
             maps[UNLOADED] = _unloaded(truth, measured)
+        page = draw_page(dataset, measured, progress) if report else None
         progress.stage("writing")
-        files = write_result(dataset, figures, {**summary(truth), "scene": scene.stated}, out, maps)
+        files = write_result(dataset, figures, {**summary(truth), "scene": scene.stated}, out, maps, page)
     _show_results(truth, files, out)
 
 

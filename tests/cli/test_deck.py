@@ -12,7 +12,7 @@ from opfem import cli
 from tests.decks.texts import imprint_deck, stacked_deck, text
 from tests.experiments import bumpy_map, inclusion_experiment, published_palpation
 
-FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", "result.nc")
+FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
 
 
 def opfem(*arguments) -> int:

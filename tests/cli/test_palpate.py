@@ -18,8 +18,8 @@ from PIL import Image
 import opfem as op
 from opfem import cli
 
-FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", "result.nc")
-FIT_FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", "result.nc")
+FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
+FIT_FILES = ("result.vtu", "pressure.png", "fit.png", "report.html", "summary.json", "result.nc")
 SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
 
 

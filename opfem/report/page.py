@@ -1,0 +1,243 @@
+"""`write_report`: a result as one page for a browser, which needs no network: maps, section, layer, numbers, sources.
+
+Edge of the chain: made from the dataset of `to_xarray`, or from one that was read back.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import xarray as xr
+from plotly.offline import get_plotlyjs
+
+from ..io import write_whole
+from ..measurement import ThicknessMap
+from ..results import ExperimentSolution, Solution, TractionFit, to_xarray
+from .checks import checks, in_short
+from .convergence import convergence_rows, energy_figure
+from .figures import map_figure
+from .inputs import NOT_RECORDED, assumptions, input_rows
+from .layer3d import STRETCH_Z, layer_figure
+from .maps import ReportMap, report_maps
+from .numbers import Row, number_rows
+from .places import Places, find_places
+from .provenance import PAPERS, citation, provenance_rows
+from .section import BAND, section_figure
+
+# Dark on light, so that the line is seen on every colour; the upper one is what the reader drags.
+_LINE_STYLES: tuple[dict[str, Any], ...] = ({"color": "#ffffff", "width": 5}, {"color": "#111111", "width": 2})
+_ORIENTATION = (
+    "As the microscope sees it through the window: x along image columns, y along image rows and downwards. A value "
+    "is where the face of the layer now lies."
+)
+
+
+def write_report(
+    data: Solution | ExperimentSolution | TractionFit | xr.Dataset,
+    path: str | os.PathLike,
+    measured: ThicknessMap | None = None,
+) -> None:
+    """Write a result as one HTML file that opens in any browser, without a network; whole or not at all.
+
+    Maps with their values under the cursor, a section along a line, the layer in three dimensions, the numbers in
+    words, what was given and what assumed, convergence and energy, versions and what to cite; 5 to 8 MB.
+
+    Args:
+        data: A solution, a fit, or the dataset of one, such as `read_netcdf` returns.
+        path: File to make or replace.
+        measured: The map as it was measured. None draws the one that was pressed in, filled and smoothed, or where the
+            result holds none, the computed thickness.
+
+    Raises:
+        ValueError: For a solve that did not converge.
+        FileNotFoundError: When the folder does not exist.
+
+    Example:
+        >>> import opfem as op
+        >>> def report_of(solution, loaded):
+        ...     op.write_report(solution, "report.html", measured=loaded)
+    """
+    dataset = data if isinstance(data, xr.Dataset) else to_xarray(data)
+    write_whole(path, report_bytes(dataset, measured))
+
+
+def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> bytes:
+    """Make the page of a report.
+
+    Args:
+        dataset: What `to_xarray` returned.
+        measured: The map as it was measured, where it is known.
+
+    Raises:
+        ValueError: For a solve that did not converge.
+    """
+    if not np.isfinite(dataset["displacement"].values).all():
+        status = dataset.attrs.get("status")
+        raise ValueError(f"There is nothing to report: the solve did not converge (status {status!r}).")
+    places = find_places(dataset, measured)
+    maps = report_maps(dataset, measured, places)
+    inputs = input_rows(dataset)
+    energy = energy_figure(dataset)
+    figures = _figures(dataset, maps, places) | ({} if energy is None else {"energy": energy})
+    noise = None if measured is None or measured.std is None else 1e3 * float(np.mean(measured.std))
+    page = Template(_packaged("page.html")).substitute(
+        version=escape(str(dataset.attrs.get("opfem_version", ""))),
+        title=escape(_heading(dataset)),
+        css=_packaged("page.css"),
+        heading=escape(_heading(dataset)),
+        subtitle=escape(_subtitle(dataset, places)),
+        short=escape(in_short(dataset)),
+        checks="".join(
+            f'<li class="{"good" if check.good else "care"}">{escape(check.words)}</li>'
+            for check in checks(dataset, maps, inputs, noise)
+        ),
+        orientation=escape(_ORIENTATION),
+        aspect=f"{np.ptp(places.y) / np.ptp(places.x):.4f}",
+        maps="".join(map(_card, maps)),
+        legend=_legend(maps),
+        section_words=escape(_section_words(dataset)),
+        layer_words=escape(_layer_words()),
+        numbers=_table(number_rows(dataset, maps)),
+        inputs_words=escape(_inputs_words(any(row.mark == NOT_RECORDED for row in inputs))),
+        inputs=_inputs_table(inputs, assumptions(dataset)),
+        convergence=_table(convergence_rows(dataset)),
+        energy="" if energy is None else '<div class="plot more energy" id="energy"></div>',
+        provenance=_pairs(provenance_rows(dataset)),
+        papers=_items([citation(dataset), *PAPERS]),
+        # plotly writes < as an escape, so that no text of a figure ends the script element.
+        plots=f"{{{','.join(f'{json.dumps(name)}:{figure.to_json()}' for name, figure in figures.items())}}}",
+        line=json.dumps(_line(places)),
+        plotly=_script(get_plotlyjs()),
+        js=_script(_packaged("page.js")),
+    )
+    return page.encode("utf-8", "backslashreplace")
+
+
+def _packaged(name: str) -> str:
+    return files("opfem.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _script(text: str) -> str:
+    """Keep a program inside its script element, which no string of it may end."""
+    return text.replace("</script", "<\\/script")
+
+
+def _line(places: Places) -> list[float]:
+    """Choose where the line lies before the reader drags it: across the middle, from one eighth to seven [mm]."""
+    x0, x1 = (float(places.x[0] + part * np.ptp(places.x)) for part in (0.125, 0.875))
+    middle = float(places.y.mean())
+    return [x0, middle, x1, middle]
+
+
+def _figures(dataset: xr.Dataset, maps: Sequence[ReportMap], places: Places) -> dict[str, go.Figure]:
+    limits = ((float(places.x[0]), float(places.x[-1])), (float(places.y[0]), float(places.y[-1])))
+    x0, y0, x1, y1 = _line(places)
+    figures = {}
+    for drawn in maps:
+        figure = map_figure(drawn, limits)
+        for style in _LINE_STYLES:
+            figure.add_shape(type="line", x0=x0, y0=y0, x1=x1, y1=y1, line=style)
+        for name, x, y in (("A", x0, y0), ("B", x1, y1)):
+            figure.add_annotation(
+                text=name, x=x, y=y, showarrow=False, bgcolor="white", bordercolor="#333", borderpad=1
+            )
+        figures[f"map-{drawn.key}"] = figure
+    return {**figures, "section": section_figure(list(maps)), "layer": layer_figure(dataset)}
+
+
+def _heading(dataset: xr.Dataset) -> str:
+    if "pressure_std" in dataset:
+        return "Stress on the sample, fitted to the thickness of a soft layer"
+    return str(dataset.attrs.get("title", "Stress on the sample"))
+
+
+def _subtitle(dataset: xr.Dataset, places: Places) -> str:
+    sides = " × ".join(f"{side:g}" for side in dataset.attrs["extent"])
+    thinned = f" Every {_ordinal(places.stride)} pixel of the map is drawn." if places.stride > 1 else ""
+    if "sample_displacement" in dataset:
+        return f"A layer of {sides} mm pressed onto a sample of known stiffness: the computed truth.{thinned}"
+    return f"A layer of {sides} mm, its thickness measured by optical coherence tomography.{thinned}"
+
+
+def _ordinal(number: int) -> str:
+    return {2: "2nd", 3: "3rd"}.get(number, f"{number}th")
+
+
+def _card(drawn: ReportMap) -> str:
+    unit = f" [{escape(drawn.unit)}]" if drawn.unit else ""
+    return (
+        f'<figure class="map-card"><figcaption><h3>{escape(drawn.title)}{unit}</h3>{escape(drawn.words)}</figcaption>'
+        f'<div class="frame"><div class="plot map" id="map-{escape(drawn.key)}"></div></div></figure>'
+    )
+
+
+def _legend(maps: Sequence[ReportMap]) -> str:
+    marks = {
+        "unmeasured": (
+            "not measured; what is computed there rests on its surroundings",
+            any(drawn.unmeasured is not None and drawn.unmeasured.any() for drawn in maps),
+        ),
+        "clear": (
+            "the layer does not touch the sample",
+            any(drawn.clear is not None and drawn.clear.any() for drawn in maps),
+        ),
+        "off": ("no layer", any(drawn.kind != "thickness" and np.isnan(drawn.values).any() for drawn in maps)),
+    }
+    return "".join(
+        f'<span><i class="swatch {name}"></i>{escape(words)}</span>' for name, (words, shown) in marks.items() if shown
+    )
+
+
+def _section_words(dataset: xr.Dataset) -> str:
+    band = f" The band is ± {BAND:g} standard deviations." if "pressure_std" in dataset else ""
+    return f"Thickness is drawn from the window downwards.{band}"
+
+
+def _layer_words() -> str:
+    return (
+        "Seen through the clear window as the microscope sees it; what stands up is where the sample presses. Coloured "
+        f"by the pressure on the sample [kPa], stretched {STRETCH_Z:g} times along its thickness. Drag to turn it."
+    )
+
+
+def _inputs_words(unrecorded: bool) -> str:
+    if unrecorded:
+        return (
+            "This result does not record which inputs were given and which assumed; results of the command line do. "
+            "Compare each with your own."
+        )
+    return "Given by whoever computed this, or assumed by opfem because nothing was said: those may not be yours."
+
+
+def _table(rows: Iterable[Row]) -> str:
+    cells = "".join(
+        f'<tr><th scope="row">{escape(row.name)}</th><td class="value">{escape(row.value)}</td>'
+        f'<td>{escape(row.unit)}</td><td class="words">{escape(row.words)}</td></tr>'
+        for row in rows
+    )
+    return f'<table class="numbers">{cells}</table>'
+
+
+def _inputs_table(rows: Iterable[Any], sentences: Sequence[str]) -> str:
+    cells = "".join(
+        f'<tr><td>{escape(row.part)}</td><th scope="row">{escape(row.name)}</th><td>{escape(row.value)}</td>'
+        f'<td class="{"assumed" if row.mark == "assumed" else "words"}">{escape(row.mark)}</td></tr>'
+        for row in rows
+    )
+    said = f"<p>Assumed in reading the input:</p><ul>{_items(sentences)}</ul>" if sentences else ""
+    return f'<table class="inputs">{cells}</table>{said}'
+
+
+def _pairs(rows: Iterable[tuple[str, str]]) -> str:
+    cells = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in rows)
+    return f"<table>{cells}</table>"
+
+
+def _items(sentences: Iterable[str]) -> str:
+    return "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
