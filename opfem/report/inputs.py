@@ -20,6 +20,7 @@ NOT_RECORDED = "not recorded"
 
 _Row = tuple[str, str, str, str]  # key, part, name, value
 
+_MATERIALS = {"MooneyRivlin": "Mooney–Rivlin", "NeoHooke": "neo-Hooke", "Hencky": "Hencky, linear in log strain"}
 _LAWS = {
     "HardOverclosure": "hard",
     "ExponentialOverclosure": "pressure rises exponentially as the gap closes",
@@ -92,7 +93,8 @@ def _layer(attrs: dict[str, Any]) -> Iterator[_Row]:
 
 
 def _material(key: str, part: str, law: dict[str, Any]) -> Iterator[_Row]:
-    yield f"{key}.law", part, "material law", law["class"]
+    kind = str(law["class"])
+    yield f"{key}.law", part, "material law", _MATERIALS.get(kind, kind)
     yield from _numbers(key, part, law)
 
 

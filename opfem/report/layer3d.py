@@ -17,6 +17,10 @@ from .maps import KPA
 STRETCH_Z = 3.0
 """How much the picture is stretched along the thickness; a layer is ten times as wide as it is thick."""
 _SIDE = "#9fb6c4"
+_BAR: dict[str, Any] = {
+    "title": {"text": "pressure on the sample [kPa]", "side": "top"}, "orientation": "h", "thickness": 12, "len": 0.7,
+    "outlinewidth": 0, "y": 0.0, "yanchor": "top",
+}  # fmt: skip
 _MOST_NODES = 200  # along one axis; more are thinned out
 
 
@@ -48,7 +52,7 @@ def layer_figure(dataset: xr.Dataset) -> go.Figure:
             "aspectratio": {name: 1.5 * value / longest for name, value in ratio.items()},
             "camera": {"eye": {"x": 0.3, "y": -1.7, "z": 1.45}, "center": {"x": 0.0, "y": 0.0, "z": -0.22}},
         },
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        margin={"l": 0, "r": 0, "t": 0, "b": 60},
         font=FONT,
     )
     return figure
@@ -70,7 +74,7 @@ def _face(points: np.ndarray, pressure: np.ndarray) -> go.Surface:
         cmin=min(0.0, float(pressure.min())),
         cmax=max(float(pressure.max()), 1e-9),
         colorscale=get_colorscale("viridis"),
-        colorbar={"title": {"text": "kPa", "side": "top"}, "thickness": 12, "len": 0.7, "outlinewidth": 0},
+        colorbar=_BAR,
         lighting={"ambient": 0.8, "diffuse": 0.5, "specular": 0.05},
         name="face at the sample",
         hovertemplate="x %{x:.2f}, y %{y:.2f}, z %{z:.3f} mm<br><b>%{surfacecolor:.2f} kPa</b><extra></extra>",

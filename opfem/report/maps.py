@@ -155,8 +155,8 @@ def _uncertainty(
     if "pressure_std" not in dataset:
         return []
     words = (
-        "Standard deviation of the pressure: the true pressure lies within two of them in 95 of 100 places, if the "
-        "noise, the material and the friction are as stated."
+        "Standard deviation that noise and missing pixels leave, if material and friction are as stated. Detail finer "
+        "than the resolution, among the numbers below, is not in it."
     )
     std = KPA * at_places(dataset["pressure_std"].values, places.sample)
     title = "Uncertainty of the pressure"

@@ -84,6 +84,21 @@
       `A (${said[0]}, ${said[1]}) mm to B (${said[2]}, ${said[3]}) mm, ${length.toFixed(2)} mm long`;
   }
 
+  // A page of paper is narrower than a screen: plots are drawn for it while it is printed; the layer is scaled instead,
+  // as what draws it takes longer than the browser waits.
+  const plotted = Object.keys(plots).filter(id => id !== "layer");
+  addEventListener("beforeprint", () => {
+    document.body.classList.add("printing");
+    for (const id of plotted) {
+      const {clientWidth: width, clientHeight: height} = document.getElementById(id);
+      Plotly.relayout(id, {width, height});
+    }
+  });
+  addEventListener("afterprint", () => {
+    document.body.classList.remove("printing");
+    for (const id of plotted) Plotly.relayout(id, {width: null, height: null, autosize: true});
+  });
+
   Promise.all([...maps.map(div => draw(div.id, config)), draw("section", plainly)]).then(() => {
     for (const div of maps) {
       div.on("plotly_relayout", change => share(change, div));
@@ -91,7 +106,11 @@
       div.on("plotly_unhover", () => leave(div));
     }
     profile();
-    document.querySelectorAll(".plot.more").forEach(div => draw(div.id, plainly));
+    document.querySelectorAll(".plot.more").forEach(div => {
+      const {scene} = plots[div.id].layout, narrow = Math.max(1, Math.sqrt(620 / div.clientWidth));
+      if (scene) for (const axis of "xyz") scene.camera.eye[axis] *= narrow;  // farther off, so that all of it is seen
+      draw(div.id, plainly);
+    });
     document.documentElement.dataset.ready = "true";
   });
 })();

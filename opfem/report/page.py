@@ -5,7 +5,7 @@ Edge of the chain: made from the dataset of `to_xarray`, or from one that was re
 
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from string import Template
@@ -25,10 +25,11 @@ from .figures import map_figure
 from .inputs import NOT_RECORDED, assumptions, input_rows
 from .layer3d import STRETCH_Z, layer_figure
 from .maps import ReportMap, report_maps
-from .numbers import Row, number_rows
+from .numbers import number_rows
 from .places import Places, find_places
 from .provenance import PAPERS, citation, provenance_rows
 from .section import BAND, section_figure
+from .tables import input_table, items, number_table, source_table
 
 # Dark on light, so that the line is seen on every colour; the upper one is what the reader drags.
 _LINE_STYLES: tuple[dict[str, Any], ...] = ({"color": "#ffffff", "width": 5}, {"color": "#111111", "width": 2})
@@ -103,13 +104,13 @@ def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> b
         legend=_legend(maps),
         section_words=escape(_section_words(dataset)),
         layer_words=escape(_layer_words()),
-        numbers=_table(number_rows(dataset, maps)),
+        numbers=number_table(number_rows(dataset, maps)),
         inputs_words=escape(_inputs_words(any(row.mark == NOT_RECORDED for row in inputs))),
-        inputs=_inputs_table(inputs, assumptions(dataset)),
-        convergence=_table(convergence_rows(dataset)),
+        inputs=input_table(inputs, assumptions(dataset)),
+        convergence=number_table(convergence_rows(dataset)),
         energy="" if energy is None else '<div class="plot more energy" id="energy"></div>',
-        provenance=_pairs(provenance_rows(dataset)),
-        papers=_items([citation(dataset), *PAPERS]),
+        provenance=source_table(provenance_rows(dataset)),
+        papers=items([citation(dataset), *PAPERS]),
         # plotly writes < as an escape, so that no text of a figure ends the script element.
         plots=f"{{{','.join(f'{json.dumps(name)}:{figure.to_json()}' for name, figure in figures.items())}}}",
         line=json.dumps(_line(places)),
@@ -136,11 +137,10 @@ def _line(places: Places) -> list[float]:
 
 
 def _figures(dataset: xr.Dataset, maps: Sequence[ReportMap], places: Places) -> dict[str, go.Figure]:
-    limits = ((float(places.x[0]), float(places.x[-1])), (float(places.y[0]), float(places.y[-1])))
     x0, y0, x1, y1 = _line(places)
     figures = {}
     for drawn in maps:
-        figure = map_figure(drawn, limits)
+        figure = map_figure(drawn, places.limits)
         for style in _LINE_STYLES:
             figure.add_shape(type="line", x0=x0, y0=y0, x1=x1, y1=y1, line=style)
         for name, x, y in (("A", x0, y0), ("B", x1, y1)):
@@ -187,7 +187,7 @@ def _legend(maps: Sequence[ReportMap]) -> str:
             "the layer does not touch the sample",
             any(drawn.clear is not None and drawn.clear.any() for drawn in maps),
         ),
-        "off": ("no layer", any(drawn.kind != "thickness" and np.isnan(drawn.values).any() for drawn in maps)),
+        "off": ("no layer", any(drawn.key == "pressure" and np.isnan(drawn.values).any() for drawn in maps)),
     }
     return "".join(
         f'<span><i class="swatch {name}"></i>{escape(words)}</span>' for name, (words, shown) in marks.items() if shown
@@ -202,7 +202,8 @@ def _section_words(dataset: xr.Dataset) -> str:
 def _layer_words() -> str:
     return (
         "Seen through the clear window as the microscope sees it; what stands up is where the sample presses. Coloured "
-        f"by the pressure on the sample [kPa], stretched {STRETCH_Z:g} times along its thickness. Drag to turn it."
+        f"by the pressure on the sample [kPa], stretched {STRETCH_Z:g} times along its thickness. Drag to turn it; "
+        "roll the wheel to come nearer."
     )
 
 
@@ -213,31 +214,3 @@ def _inputs_words(unrecorded: bool) -> str:
             "Compare each with your own."
         )
     return "Given by whoever computed this, or assumed by opfem because nothing was said: those may not be yours."
-
-
-def _table(rows: Iterable[Row]) -> str:
-    cells = "".join(
-        f'<tr><th scope="row">{escape(row.name)}</th><td class="value">{escape(row.value)}</td>'
-        f'<td>{escape(row.unit)}</td><td class="words">{escape(row.words)}</td></tr>'
-        for row in rows
-    )
-    return f'<table class="numbers">{cells}</table>'
-
-
-def _inputs_table(rows: Iterable[Any], sentences: Sequence[str]) -> str:
-    cells = "".join(
-        f'<tr><td>{escape(row.part)}</td><th scope="row">{escape(row.name)}</th><td>{escape(row.value)}</td>'
-        f'<td class="{"assumed" if row.mark == "assumed" else "words"}">{escape(row.mark)}</td></tr>'
-        for row in rows
-    )
-    said = f"<p>Assumed in reading the input:</p><ul>{_items(sentences)}</ul>" if sentences else ""
-    return f'<table class="inputs">{cells}</table>{said}'
-
-
-def _pairs(rows: Iterable[tuple[str, str]]) -> str:
-    cells = "".join(f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>' for name, value in rows)
-    return f"<table>{cells}</table>"
-
-
-def _items(sentences: Iterable[str]) -> str:
-    return "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)

@@ -29,6 +29,7 @@ class Places(NamedTuple):
     Attributes:
         x: Of image columns [mm].
         y: Of image rows [mm].
+        limits: Ends of x and of y [mm], of the whole map.
         stride: Every how many pixels of the map are drawn.
         sample: Row and column, in nodes, of the point of the interface under each pixel; NaN off the layer.
         window: The same of the face at the window.
@@ -36,6 +37,7 @@ class Places(NamedTuple):
 
     x: Axis
     y: Axis
+    limits: tuple[tuple[float, float], tuple[float, float]]
     stride: int
     sample: At
     window: At
@@ -52,7 +54,8 @@ def find_places(dataset: xr.Dataset, measured: ThicknessMap | None) -> Places:
     stride = max(1, int(np.ceil(max(len(axis) for axis in axes) / MOST_PIXELS)))
     x, y = (_axis(np.asarray(axis), stride) for axis in axes)
     u = dataset["displacement"].transpose("component", "z", "y", "x").values
-    return Places(x, y, stride, _under(dataset, u[:2, -1], x, y), _under(dataset, u[:2, 0], x, y))
+    limits = ((float(axes[0][0]), float(axes[0][-1])), (float(axes[1][0]), float(axes[1][-1])))
+    return Places(x, y, limits, stride, _under(dataset, u[:2, -1], x, y), _under(dataset, u[:2, 0], x, y))
 
 
 def at_places(nodal: np.ndarray, at: At) -> Grid:

@@ -193,6 +193,46 @@ def test_experiment(truth, tmp_path):
     assert found["approach of plate and window"][0][2] == "0.2 mm"
 
 
+def test_energies_over_time_are_drawn(dataset, page, tmp_path):
+    assert "energy" not in plots(page)
+    time = np.linspace(0.0, 1.0, 5)
+    names = ("strain", "kinetic", "contact", "friction", "viscous", "damping", "external")
+    energies = {f"energy_{name}": ("output", (number + 1) * 1e-3 * time) for number, name in enumerate(names)}
+    ratios = {"kinetic_ratio": 4e-3, "energy_drift": 1e-3}
+    explicit = dataset.assign(output_time=("output", time), **energies, **{k: ((), v) for k, v in ratios.items()})
+    page = written(explicit, tmp_path / "report.html")
+    drawn = plots(page)["energy"]
+    assert len(drawn["data"]) == len(names)
+    assert drawn["layout"]["yaxis"]["title"]["text"] == "energy [µJ]"
+    assert 'id="energy"' in page
+    assert rows(page)["Kinetic energy"][0][1:3] == ["0.4", "%"]
+
+
+def test_fit_shows_its_uncertainty(dataset, loaded, tmp_path):
+    prior = json.dumps({"class": "Matern", "length": 0.5, "std": 2e-3})
+    fitted = dataset.drop_vars("residual").assign(
+        pressure_std=0.1 * dataset["pressure"],
+        residual=(("y", "x"), np.full(dataset["pressure"].shape, -2e-3)),
+        reduced_chi2=((), 3.0),
+        resolution_width=("resolution_point", [0.2, 0.3, 0.4]),
+        model_std=((), 1e-3),
+        **dict.fromkeys(("forward_solves", "inner_iterations", "std_error", "draws"), ((), 3.0)),
+    )
+    fitted = fitted.assign_attrs(fit_status="successful", fit_message="", prior=prior)
+    page = written(fitted, tmp_path / "report.html", loaded)
+    drawn, found = plots(page), rows(page)
+    assert "map-uncertainty" in drawn
+    assert [curve["meta"]["stds"] for curve in drawn["section"]["data"]] == [0, 0, -2.0, 2.0, 0]
+    assert found["Resolution"][0][1:3] == ["300", "µm"]
+    assert found["correlation length"][0][2] == "0.5 mm"
+    assert "far from 1" in words(page)
+    # Without the map, what a fit misses is its own residual, which is computed less measured.
+    alone = written(fitted.drop_vars(["imposed_thickness", "missing"]), tmp_path / "alone.html")
+    assert plots(alone)["map-residual"]["data"][0]["z"]["shape"] == "7, 7"
+    assert rows(alone)["What the computation misses"][0][1:3] == ["2", "µm"]
+    assert "Thickness, computed" in words(alone)
+
+
 def test_failed_solve_is_refused(failed_solution, tmp_path):
     with pytest.raises(ValueError, match="did not converge"):
         op.write_report(failed_solution, tmp_path / "report.html")
