@@ -21,6 +21,7 @@ from .options import (
     LayerOptions,
     MapOptions,
     MicroscopeOptions,
+    ResultOptions,
     RunOptions,
     SolverOptions,
     StepOptions,
@@ -82,16 +83,17 @@ def palpate(
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
     deck: WriteOptions = WriteOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
 
-    Writes result.nc, result.vtu, summary.json, pressure.png and report.png.
+    Writes result.nc, result.vtu, summary.json, pressure.png and report.png; with --also files for other programs.
     """
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, deck, run)
+        palpate(map, out, reading, layer, contact, solver, deck, run, files)
 
 
 @app.command
@@ -105,6 +107,7 @@ def fit(
     contact: ContactOptions = ContactOptions(),
     asked: FitOptions = FitOptions(),
     steps: StepOptions = StepOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit the traction on the sample to a measured thickness map, with its uncertainty.
@@ -115,7 +118,7 @@ def fit(
     from .fit import fit
 
     with reporting(run.debug):
-        fit(map, out, reading, layer, contact, asked, steps, run)
+        fit(map, out, reading, layer, contact, asked, steps, run, files)
 
 
 @app.command
@@ -153,6 +156,7 @@ def simulate(
     *,
     out: _Out,
     deck: WriteOptions = WriteOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
@@ -163,7 +167,7 @@ def simulate(
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, deck, run)
+        simulate(scene, out, deck, run, files)
 
 
 @app.command
@@ -176,6 +180,7 @@ def deck(
         bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
     ] = False,
     asked: DeckOptions = DeckOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve an Abaqus or CalculiX deck: a soft layer between rigid bodies, or under a soft sample; step by step.
@@ -191,7 +196,7 @@ def deck(
         elif out is None:
             raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
         else:
-            solve_deck(file, out, asked, run)
+            solve_deck(file, out, asked, run, files)
 
 
 @app.command
@@ -259,10 +264,11 @@ def demo(
     out: _Out = Path("opfem_demo"),
     coin: Annotated[bool, Parameter(help="Take the published map of a 5-cent coin (downloaded once, GPL-3).")] = False,
     solver: SolverOptions = SolverOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Show what opfem does: the stress map of a built-in measurement, or of the published coin."""
     from .palpate import demo
 
     with reporting(run.debug):
-        demo(out, coin, solver, run)
+        demo(out, coin, solver, run, files)

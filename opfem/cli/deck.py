@@ -20,7 +20,8 @@ from ..solvers import ConvergenceError, ExperimentSolution, Explicit, Newton, So
 from ..solvers.progress import Progress
 from .deck_options import DeckOptions
 from .folder import DECK_PICTURE, prepare, record_failure, settle, write_result
-from .options import RunOptions
+from .options import ResultOptions, RunOptions
+from .output import show_warnings
 from .statement import configure_jax
 
 INCREMENT = "axial_increment"
@@ -128,7 +129,9 @@ def _picture(deck: Deck, bodies: list[Body], loads: tuple[Any, ...]) -> bytes:
     return picture.getvalue()
 
 
-def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> None:
+def solve_deck(
+    file: Path, out: Path, asked: DeckOptions, run: RunOptions, files: ResultOptions = ResultOptions()
+) -> None:
     """Solve all steps of a deck and write them, the last one last.
 
     Args:
@@ -136,6 +139,7 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
         out: Folder of the results.
         asked: How it is taken.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -162,13 +166,13 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
             record_failure({**summary(failure.solution), "step": step.name, "deck": record, "steps": steps}, out)
             raise ConvergenceError(f"Step {step.name}: {failure}", failure.solution) from None
         numbers = summary(solution)
-        files = _write(solution, before, {**numbers, "step": step.name, "deck": record, "steps": steps}, folder, run)
+        said = {**numbers, "step": step.name, "deck": record, "steps": steps}
+        written = _write(solution, before, said, folder, run, files)
         steps = [*steps, {"step": step.name, **numbers}]
         before = solution
         console.print(_results(step.name, numbers))
-        if numbers["status_message"]:
-            console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
-        console.print(f"Wrote {', '.join(files)} to {folder}", markup=False, soft_wrap=True)
+        show_warnings(numbers)
+        console.print(f"Wrote {', '.join(written)} to {folder}", markup=False, soft_wrap=True)
 
 
 def _solver(deck: Deck, asked: DeckOptions) -> Newton | Explicit:
@@ -194,6 +198,7 @@ def _write(
     numbers: dict[str, Any],
     folder: Path,
     run: RunOptions,
+    files: ResultOptions,
 ) -> list[str]:
     """Write every file of a step; return their names."""
     settle(folder, run.force)
@@ -211,9 +216,10 @@ def _write(
             figures = draw_pictures(dataset, measured)
         else:
             spacing = np.asarray(solution.experiment.extent) / solution.experiment.layer_elements[:2]
-            figures = draw_simulation(dataset, measured_thickness(solution, spacing))
+            measured = measured_thickness(solution, spacing)
+            figures = draw_simulation(dataset, measured)
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, folder)
+        return write_result(dataset, figures, numbers, folder, measured=measured, asked=files)
 
 
 def axial_increment(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution) -> xr.DataArray:

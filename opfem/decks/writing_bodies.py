@@ -24,12 +24,8 @@ class Written(NamedTuple):
 
 
 def show(value: Any) -> str:
-    """Write a number in the 20 characters that both codes read of a field.
-
-    With a point before an exponent: CalculiX 2.20 takes `1e-07` under *SPRING for no data.
-    """
-    number, exponent, power = f"{float(value):.13g}".partition("e")
-    return f"{number}." + exponent + power if exponent and "." not in number else number + exponent + power
+    """Write a number in the 20 characters that both codes read of a field."""
+    return f"{float(value):.13g}"
 
 
 class Bodies:

@@ -36,8 +36,8 @@ _FIRST_VISCOSITY = 1.5
 _VISCOSITY_FACTOR = 3.0
 _NO_VISCOSITY = 1e-6
 _MOST_VISCOSITY = 100.0
-# Relative residual that is enough on the way, over that of a result, and most Newton steps for it.
-_VISCOUS_RTOL = 10.0
+# Relative residual that is enough on the way, and most Newton steps for it.
+_VISCOUS_RTOL = 1e-6
 _VISCOUS_STEPS = 12
 # Solves of one snap before it is given up.
 _SNAP_SOLVES = 80
@@ -159,7 +159,7 @@ def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping
     moved = moved._replace(u=problem.project(moved.u, held))
     guess = jax.tree.map(lambda v, d: v + ahead * d, s.origin.unknowns, moved)
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, s.viscosity)
-    on_the_way = (_VISCOUS_RTOL * settings.rtol, _VISCOUS_STEPS)
+    on_the_way = (_VISCOUS_RTOL, _VISCOUS_STEPS)
     limits = [
         jnp.where(s.viscosity > 0, *both) for both in zip(on_the_way, (settings.rtol, settings.max_steps), strict=True)
     ]
