@@ -22,7 +22,7 @@ from .options import (
     LayerOptions,
     MapOptions,
     MicroscopeOptions,
-    ReportOptions,
+    ResultOptions,
     RunOptions,
     SolverOptions,
     StepOptions,
@@ -85,17 +85,18 @@ def palpate(
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
     deck: WriteOptions = WriteOptions(),
-    report: ReportOptions = ReportOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
 
-    Writes result.nc, result.vtu, summary.json, pressure.png, report.png and report.html, which opens in a browser.
+    Writes result.nc, result.vtu, summary.json, report.html, the first thing to look at, pressure.png and report.png;
+    with --also files for other programs.
     """
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, deck, run, report.report)
+        palpate(map, out, reading, layer, contact, solver, deck, run, files)
 
 
 @app.command
@@ -109,18 +110,18 @@ def fit(
     contact: ContactOptions = ContactOptions(),
     asked: FitOptions = FitOptions(),
     steps: StepOptions = StepOptions(),
-    report: ReportOptions = ReportOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit the traction on the sample to a measured thickness map, with its uncertainty.
 
     Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
-    summary.json, pressure.png, fit.png and report.html, which opens in a browser.
+    summary.json, report.html, the first thing to look at, pressure.png and fit.png.
     """
     from .fit import fit
 
     with reporting(run.debug):
-        fit(map, out, reading, layer, contact, asked, steps, run, report.report)
+        fit(map, out, reading, layer, contact, asked, steps, run, files)
 
 
 @app.command
@@ -158,18 +159,18 @@ def simulate(
     *,
     out: _Out,
     deck: WriteOptions = WriteOptions(),
-    report: ReportOptions = ReportOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
 
     Writes map.npz, which palpate and fit take with its noise, result.nc and result.vtu (the truth), summary.json,
-    section.png, report.png and report.html, which opens in a browser; l0.npz where the layer's thickness is a map.
+    report.html, section.png and report.png; l0.npz where the layer's thickness is a map.
     """
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, deck, run, report.report)
+        simulate(scene, out, deck, run, files)
 
 
 @app.command
@@ -182,7 +183,7 @@ def deck(
         bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
     ] = False,
     asked: DeckOptions = DeckOptions(),
-    report: ReportOptions = ReportOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve an Abaqus or CalculiX deck: a soft layer between rigid bodies, or under a soft sample; step by step.
@@ -199,7 +200,7 @@ def deck(
         elif out is None:
             raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
         else:
-            solve_deck(file, out, asked, run, report.report)
+            solve_deck(file, out, asked, run, files)
 
 
 @app.command
@@ -267,10 +268,11 @@ def demo(
     out: _Out = Path("opfem_demo"),
     coin: Annotated[bool, Parameter(help="Take the published map of a 5-cent coin (downloaded once, GPL-3).")] = False,
     solver: SolverOptions = SolverOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Show what opfem does: the stress map of a built-in measurement, or of the published coin."""
     from .palpate import demo
 
     with reporting(run.debug):
-        demo(out, coin, solver, run)
+        demo(out, coin, solver, run, files)

@@ -20,8 +20,9 @@ from ..solvers import ConvergenceError, ExperimentSolution, Explicit, Newton, So
 from ..solvers.progress import Progress
 from .deck_options import DeckOptions
 from .folder import DECK_PICTURE, prepare, record_failure, settle, write_result
-from .options import RunOptions
-from .record import draw_page, with_record
+from .options import ResultOptions, RunOptions
+from .output import show_warnings
+from .record import with_record
 from .statement import configure_jax
 
 INCREMENT = "axial_increment"
@@ -129,7 +130,9 @@ def _picture(deck: Deck, bodies: list[Body], loads: tuple[Any, ...]) -> bytes:
     return picture.getvalue()
 
 
-def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions, report: bool = True) -> None:
+def solve_deck(
+    file: Path, out: Path, asked: DeckOptions, run: RunOptions, files: ResultOptions = ResultOptions()
+) -> None:
     """Solve all steps of a deck and write them, the last one last.
 
     Args:
@@ -137,7 +140,7 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions, repor
         out: Folder of the results.
         asked: How it is taken.
         run: The run itself.
-        report: Whether to write report.html.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -164,14 +167,13 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions, repor
             record_failure({**summary(failure.solution), "step": step.name, "deck": record, "steps": steps}, out)
             raise ConvergenceError(f"Step {step.name}: {failure}", failure.solution) from None
         numbers = summary(solution)
-        numbers_of_all = {**numbers, "step": step.name, "deck": record, "steps": steps}
-        files = _write(solution, before, numbers_of_all, folder, run, report)
+        said = {**numbers, "step": step.name, "deck": record, "steps": steps}
+        written = _write(solution, before, said, folder, run, files)
         steps = [*steps, {"step": step.name, **numbers}]
         before = solution
         console.print(_results(step.name, numbers))
-        if numbers["status_message"]:
-            console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
-        console.print(f"Wrote {', '.join(files)} to {folder}", markup=False, soft_wrap=True)
+        show_warnings(numbers)
+        console.print(f"Wrote {', '.join(written)} to {folder}", markup=False, soft_wrap=True)
 
 
 def _solver(deck: Deck, asked: DeckOptions) -> Newton | Explicit:
@@ -197,7 +199,7 @@ def _write(
     numbers: dict[str, Any],
     folder: Path,
     run: RunOptions,
-    report: bool,
+    files: ResultOptions,
 ) -> list[str]:
     """Write every file of a step; return their names."""
     settle(folder, run.force)
@@ -206,7 +208,7 @@ def _write(
         progress.stage("pictures")
         from ..plot import draw_pictures, draw_simulation
 
-        dataset = with_record(to_xarray(solution), [], numbers["deck"]["assumed"])
+        dataset = with_record(to_xarray(solution), [], numbers["deck"]["assumed"], numbers["warnings"])
         if before is not None:
             dataset[INCREMENT] = axial_increment(solution, before)
         if isinstance(solution, Solution):
@@ -216,9 +218,8 @@ def _write(
         else:
             spacing = np.asarray(solution.experiment.extent) / solution.experiment.layer_elements[:2]
             figures = draw_simulation(dataset, measured_thickness(solution, spacing))
-        page = draw_page(dataset, None, progress) if report else None
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, folder, report=page)
+        return write_result(dataset, figures, numbers, folder, asked=files)  # nothing of a deck is measured
 
 
 def axial_increment(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution) -> xr.DataArray:

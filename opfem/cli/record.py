@@ -9,8 +9,6 @@ from typing import Any
 
 import xarray as xr
 
-from ..measurement import ThicknessMap
-from ..solvers.progress import Progress
 from .command_line import command_line, given_options
 
 # Options, and the inputs that are assumed without them.
@@ -58,31 +56,20 @@ def assumed_keys(stated: Mapping[str, Any]) -> list[str]:
     return [name for (section, key), names in _KEYS.items() if key not in stated[section] for name in names]
 
 
-def with_record(dataset: xr.Dataset, assumed: Iterable[str], assumptions: Iterable[str] = ()) -> xr.Dataset:
+def with_record(
+    dataset: xr.Dataset, assumed: Iterable[str], assumptions: Iterable[str] = (), warnings: Iterable[str] = ()
+) -> xr.Dataset:
     """Add to a result what made it; only types that netCDF stores.
 
     Args:
         dataset: What `to_xarray` returned.
         assumed: Inputs that nobody stated.
         assumptions: Sentences of what was read into a file.
+        warnings: Sentences of what limits the result.
     """
     return dataset.assign_attrs(
         command=command_line(),
         assumed=json.dumps(list(assumed)),
         assumptions=json.dumps(list(assumptions)),
+        warnings=json.dumps(list(warnings)),
     )
-
-
-def draw_page(dataset: xr.Dataset, measured: ThicknessMap | None, progress: Progress) -> bytes:
-    """Make report.html.
-
-    Args:
-        dataset: What was solved or fitted.
-        measured: The map as measured, where there is one.
-        progress: Of the run.
-    """
-    progress.stage("report")
-    # Loaded here, so that a refused run does not wait for plotly.
-    from ..report import report_bytes
-
-    return report_bytes(dataset, measured)

@@ -85,7 +85,7 @@ class HardOverclosure(AbstractOverclosure):
         Nocedal and Wright, Numerical Optimization, chapter 17 (method of multipliers).
 
     Args:
-        stiffness_ratio: Penalty stiffness over element stiffness [-]; None is 10, and 1000 where not exact.
+        stiffness_ratio: Penalty stiffness over element stiffness [-]; None is 5, and 1000 where not exact.
         exact: Whether penetration is to vanish.
 
     Raises:

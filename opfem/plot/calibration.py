@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..results import Calibration
-from .maps import shown_figure
+from .layout import shown_figure
 
 _KPA = 1e3
 _SIZE = (6.4, 5.6)  # inches

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..measurement.oct import DisplacementVolume
-from .maps import shown_figure
+from .layout import shown_figure
 
 _NM, _UM = 1e6, 1e3
 _SIZE = (10.4, 4.4)  # inches

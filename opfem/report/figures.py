@@ -21,6 +21,7 @@ _SCALES = {"size": "viridis", "thickness": "viridis", "uncertainty": "cividis", 
 STATUS_COLOURS = ("#e4e4e4", "#0072b2", "#e69f00")
 # Nothing, no contact, the two shades of the hatching, seen on every colour, and no layer.
 _COVERS = ("rgba(0, 0, 0, 0)", "#d4d4d4", "#3a3a3a", "#f6f6f6", "#ffffff")
+_SMOOTHED = 100  # pixels along x: what has fewer is drawn smoothly between them
 _HATCHING_WIDTH = 0.012  # of a line, over the longer side of the map
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": "#1b1b1b"}
 AXIS: dict[str, Any] = {
@@ -61,7 +62,7 @@ def _image(drawn: ReportMap) -> go.Heatmap:
     common: dict[str, Any] = {"x": drawn.x, "y": drawn.y, "name": drawn.title, "hoverongaps": False}
     if drawn.kind == "status":
         return go.Heatmap(
-            z=np.where(np.isfinite(drawn.values), drawn.values, -1).astype(np.int8),
+            z=drawn.values.astype(np.int8),
             zmin=-0.5,
             zmax=len(STATUS) - 0.5,
             colorscale=_steps(STATUS_COLOURS),
@@ -77,6 +78,7 @@ def _image(drawn: ReportMap) -> go.Heatmap:
         zmax=high,
         colorscale=get_colorscale(_SCALES[drawn.kind]),
         colorbar=_bar(),
+        zsmooth="best" if drawn.x.size < _SMOOTHED else False,
         hovertemplate=f"{where}<b>%{{z:.{_digits(high - low)}f}} {drawn.unit}</b><extra></extra>",
         **common,
     )
@@ -108,7 +110,7 @@ def _covered(drawn: ReportMap) -> np.ndarray:
     if drawn.unmeasured is not None:
         code = np.where(drawn.unmeasured, _hatching(drawn), code)
     if drawn.kind == "status":
-        code[np.isnan(drawn.values)] = 4
+        code[drawn.values < 0] = 4
     return code.astype(np.int8)
 
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from ..results.fields import node_areas
-from .maps import KPA, OPEN, STATUS, UM, ReportMap, loaded_thickness
+from ..results import residual_rms
+from .maps import KPA, OPEN, STATUS, UM
 
 _SMALLEST = 1e-3  # mN: smaller lateral forces are round-off
 
@@ -31,21 +31,21 @@ class Row(NamedTuple):
     words: str
 
 
-def number_rows(dataset: xr.Dataset, maps: list[ReportMap]) -> list[Row]:
+def number_rows(dataset: xr.Dataset, pixels: xr.Dataset) -> list[Row]:
     """Lay out the results for reading.
 
     Args:
         dataset: What `to_xarray` returned for a solve that converged.
-        maps: Of the report.
+        pixels: What `on_pixels` returned for it.
     """
     force = dataset["force_sample"].values
     return [
         Row("Force on the layer", f"{1e3 * -force[2]:.4g}", "mN", "of the sample, at a right angle to the window"),
         Row("Force along the layer", _small(1e3 * math.hypot(*force[:2])), "mN", "of the sample, by friction"),
         *_pressures(dataset),
-        *_compression(dataset),
+        *_compression(pixels),
         *_touching(dataset),
-        *_misfit(maps),
+        *_misfit(dataset, pixels),
         *_fit(dataset),
     ]
 
@@ -56,37 +56,28 @@ def _small(value: float) -> str:
 
 
 def touching_share(dataset: xr.Dataset) -> float:
-    """Compute the part of the layer's unloaded area that touches the sample [-]."""
-    return float(np.sum(_unloaded_areas(dataset)[_touches(dataset)]) / np.sum(_unloaded_areas(dataset)))
+    """Compute the part of the loaded layer's area that touches the sample [-]."""
+    return float(dataset["node_area"].values[_touches(dataset)].sum() / dataset["node_area"].values.sum())
 
 
 def mean_pressure(dataset: xr.Dataset) -> float:
     """Compute the mean pressure over the area that touches the sample [kPa]; zero where nothing touches."""
-    area = _loaded_areas(dataset) * _touches(dataset)
-    total = float(np.sum(area))
-    return KPA * float(np.sum(dataset["pressure"].values * area)) / total if total else 0.0
+    area = dataset["node_area"].values * _touches(dataset)
+    return KPA * float(np.sum(dataset["pressure"].values * area)) / max(float(np.sum(area)), np.finfo(float).tiny)
 
 
-def residual_rms(maps: list[ReportMap]) -> float | None:
-    """Compute the root mean square of the residual [µm] where the layer touches; None where there is no such map."""
-    for drawn in maps:
-        if drawn.key == "residual":
-            known = np.isfinite(drawn.values) if drawn.clear is None else np.isfinite(drawn.values) & ~drawn.clear
-            return float(np.sqrt(np.mean(drawn.values[known] ** 2))) if known.any() else None
-    return None
+def compression(pixels: xr.Dataset) -> tuple[float, float]:
+    """Compute the mean and the largest compression where the sample touches [%]; NaN where it does not.
+
+    Args:
+        pixels: What `on_pixels` returned.
+    """
+    values = 100.0 * pixels["compression"].values[pixels["contact_status"].values > OPEN]
+    return (float(values.mean()), float(values.max())) if values.size else (math.nan, math.nan)
 
 
 def _touches(dataset: xr.Dataset) -> np.ndarray:
     return dataset["contact_status"].values != OPEN
-
-
-def _unloaded_areas(dataset: xr.Dataset) -> np.ndarray:
-    x, y = np.meshgrid(dataset["x"].values, dataset["y"].values)
-    return node_areas(x, y, dataset["unloaded_thickness"].values)
-
-
-def _loaded_areas(dataset: xr.Dataset) -> np.ndarray:
-    return node_areas(dataset["x_current"].values, dataset["y_current"].values, loaded_thickness(dataset))
 
 
 def _pressures(dataset: xr.Dataset) -> list[Row]:
@@ -100,37 +91,39 @@ def _pressures(dataset: xr.Dataset) -> list[Row]:
     ]
 
 
-def _compression(dataset: xr.Dataset) -> list[Row]:
-    compression = 100.0 * (1.0 - loaded_thickness(dataset) / dataset["unloaded_thickness"].values)
-    area = _unloaded_areas(dataset)
-    mean = float(np.sum(compression * area) / np.sum(area))
-    words = "of the unloaded thickness, over the whole layer; negative where it is thicker than unloaded"
+def _compression(pixels: xr.Dataset) -> list[Row]:
+    mean, largest = compression(pixels)
     return [
-        Row("Compression, mean", f"{mean:.3g}", "%", words),
-        Row("Compression, largest", f"{compression.max():.3g}", "%", "where the layer is thinnest"),
+        Row("Compression, mean", f"{mean:.3g}", "%", "of the unloaded thickness, where the sample touches"),
+        Row("Compression, largest", f"{largest:.3g}", "%", "where the layer is thinnest"),
     ]
 
 
 def _touching(dataset: xr.Dataset) -> list[Row]:
-    area = _unloaded_areas(dataset)
     rows = []
     for prefix, other in (("", "sample"), ("window_", "window")):
-        status = dataset[f"{prefix}contact_status"].values
-        shares = [f"{100.0 * np.sum(area[status == code]) / np.sum(area):.0f}" for code in range(len(STATUS))]
-        rows.append(Row(f"Contact with the {other}", " / ".join(shares), "% of area", " / ".join(STATUS)))
+        status, area = (dataset[f"{prefix}{name}"].values for name in ("contact_status", "node_area"))
+        areas = " / ".join(f"{area[status == code].sum():.3g}" for code in range(len(STATUS)))
+        rows.append(Row(f"Contact with the {other}", areas, "mm²", f"{' / '.join(STATUS)}, of {area.sum():.3g} mm²"))
     return rows
 
 
-def _misfit(maps: list[ReportMap]) -> list[Row]:
-    rms = residual_rms(maps)
+def _misfit(dataset: xr.Dataset, pixels: xr.Dataset) -> list[Row]:
+    """Say what the computed thickness misses, where something was measured."""
+    if "sample_displacement" in dataset:
+        return []
     words = "root mean square of measured less computed thickness, where the layer touches"
-    return [] if rms is None else [Row("What the computation misses", f"{rms:.2g}", "µm", words)]
+    rms = UM * residual_rms(pixels)
+    if math.isnan(rms) and "misfit_rms" in dataset:
+        rms, words = UM * float(dataset["misfit_rms"]), "root mean square, as the fit counts it"
+    return [] if math.isnan(rms) else [Row("What the computation misses", f"{rms:.2g}", "µm", words)]
 
 
 def _fit(dataset: xr.Dataset) -> list[Row]:
     if "pressure_std" not in dataset:
         return []
-    std = KPA * float(np.sum(dataset["pressure_std"].values * (area := _loaded_areas(dataset))) / np.sum(area))
+    area = dataset["node_area"].values
+    std = KPA * float(np.sum(dataset["pressure_std"].values * area) / np.sum(area))
     width = UM * float(np.median(dataset["resolution_width"].values))
     rows = [
         Row("Uncertainty of the pressure", f"{std:.2g}", "kPa", "one standard deviation, mean over the layer"),

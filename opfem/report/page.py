@@ -18,15 +18,14 @@ from plotly.offline import get_plotlyjs
 
 from ..io import write_whole
 from ..measurement import ThicknessMap
-from ..results import ExperimentSolution, Solution, TractionFit, to_xarray
-from .checks import checks, in_short
+from ..results import ExperimentSolution, Solution, TractionFit, on_pixels, summary, to_xarray
+from .checks import WARNINGS, checks, in_short
 from .convergence import convergence_rows, energy_figure
 from .figures import map_figure
 from .inputs import NOT_RECORDED, assumptions, input_rows
 from .layer3d import STRETCH_Z, layer_figure
-from .maps import ReportMap, report_maps
+from .maps import ReportMap, report_maps, stride_of
 from .numbers import number_rows
-from .places import Places, find_places
 from .provenance import PAPERS, citation, provenance_rows
 from .section import BAND, section_figure
 from .tables import input_table, items, number_table, source_table
@@ -64,8 +63,14 @@ def write_report(
         >>> def report_of(solution, loaded):
         ...     op.write_report(solution, "report.html", measured=loaded)
     """
-    dataset = data if isinstance(data, xr.Dataset) else to_xarray(data)
-    write_whole(path, report_bytes(dataset, measured))
+    write_whole(path, report_bytes(data if isinstance(data, xr.Dataset) else _with_warnings(data, measured), measured))
+
+
+def _with_warnings(data: Solution | ExperimentSolution | TractionFit, measured: ThicknessMap | None) -> xr.Dataset:
+    fit, solution = (data, data.solution) if isinstance(data, TractionFit) else (None, data)
+    warnings = summary(solution, measured)["warnings"]
+    advice = "" if fit is None else fit.advice()
+    return to_xarray(data).assign_attrs({WARNINGS: json.dumps([*warnings, advice] if advice else warnings)})
 
 
 def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> bytes:
@@ -81,30 +86,30 @@ def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> b
     if not np.isfinite(dataset["displacement"].values).all():
         status = dataset.attrs.get("status")
         raise ValueError(f"There is nothing to report: the solve did not converge (status {status!r}).")
-    places = find_places(dataset, measured)
-    maps = report_maps(dataset, measured, places)
+    pixels = on_pixels(dataset, measured)
+    maps = report_maps(dataset, pixels, measured is not None)
     inputs = input_rows(dataset)
     energy = energy_figure(dataset)
-    figures = _figures(dataset, maps, places) | ({} if energy is None else {"energy": energy})
-    noise = None if measured is None or measured.std is None else 1e3 * float(np.mean(measured.std))
+    x, y = _limits(pixels)
+    figures = _figures(dataset, maps, pixels) | ({} if energy is None else {"energy": energy})
     page = Template(_packaged("page.html")).substitute(
         version=escape(str(dataset.attrs.get("opfem_version", ""))),
         title=escape(_heading(dataset)),
         css=_packaged("page.css"),
         heading=escape(_heading(dataset)),
-        subtitle=escape(_subtitle(dataset, places)),
-        short=escape(in_short(dataset)),
+        subtitle=escape(_subtitle(dataset, stride_of(pixels))),
+        short=escape(in_short(dataset, pixels)),
         checks="".join(
             f'<li class="{"good" if check.good else "care"}">{escape(check.words)}</li>'
-            for check in checks(dataset, maps, inputs, noise)
+            for check in checks(dataset, pixels, inputs)
         ),
         orientation=escape(_ORIENTATION),
-        aspect=f"{np.ptp(places.y) / np.ptp(places.x):.4f}",
+        aspect=f"{(y[1] - y[0]) / (x[1] - x[0]):.4f}",
         maps="".join(map(_card, maps)),
         legend=_legend(maps),
         section_words=escape(_section_words(dataset)),
         layer_words=escape(_layer_words()),
-        numbers=number_table(number_rows(dataset, maps)),
+        numbers=number_table(number_rows(dataset, pixels)),
         inputs_words=escape(_inputs_words(any(row.mark == NOT_RECORDED for row in inputs))),
         inputs=input_table(inputs, assumptions(dataset)),
         convergence=number_table(convergence_rows(dataset)),
@@ -113,7 +118,7 @@ def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> b
         papers=items([citation(dataset), *PAPERS]),
         # plotly writes < as an escape, so that no text of a figure ends the script element.
         plots=f"{{{','.join(f'{json.dumps(name)}:{figure.to_json()}' for name, figure in figures.items())}}}",
-        line=json.dumps(_line(places)),
+        line=json.dumps(_line(pixels)),
         plotly=_script(get_plotlyjs()),
         js=_script(_packaged("page.js")),
     )
@@ -129,18 +134,23 @@ def _script(text: str) -> str:
     return text.replace("</script", "<\\/script")
 
 
-def _line(places: Places) -> list[float]:
+def _limits(pixels: xr.Dataset) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Find the ends of the maps along x and y [mm]."""
+    x, y = ((float(axis[0]), float(axis[-1])) for axis in (pixels["x_image"].values, pixels["y_image"].values))
+    return x, y
+
+
+def _line(pixels: xr.Dataset) -> list[float]:
     """Choose where the line lies before the reader drags it: across the middle, from one eighth to seven [mm]."""
-    x0, x1 = (float(places.x[0] + part * np.ptp(places.x)) for part in (0.125, 0.875))
-    middle = float(places.y.mean())
-    return [x0, middle, x1, middle]
+    (x0, x1), y = _limits(pixels)
+    return [x0 + 0.125 * (x1 - x0), sum(y) / 2, x0 + 0.875 * (x1 - x0), sum(y) / 2]
 
 
-def _figures(dataset: xr.Dataset, maps: Sequence[ReportMap], places: Places) -> dict[str, go.Figure]:
-    x0, y0, x1, y1 = _line(places)
+def _figures(dataset: xr.Dataset, maps: Sequence[ReportMap], pixels: xr.Dataset) -> dict[str, go.Figure]:
+    x0, y0, x1, y1 = _line(pixels)
     figures = {}
     for drawn in maps:
-        figure = map_figure(drawn, places.limits)
+        figure = map_figure(drawn, _limits(pixels))
         for style in _LINE_STYLES:
             figure.add_shape(type="line", x0=x0, y0=y0, x1=x1, y1=y1, line=style)
         for name, x, y in (("A", x0, y0), ("B", x1, y1)):
@@ -157,9 +167,9 @@ def _heading(dataset: xr.Dataset) -> str:
     return str(dataset.attrs.get("title", "Stress on the sample"))
 
 
-def _subtitle(dataset: xr.Dataset, places: Places) -> str:
+def _subtitle(dataset: xr.Dataset, stride: int) -> str:
     sides = " × ".join(f"{side:g}" for side in dataset.attrs["extent"])
-    thinned = f" Every {_ordinal(places.stride)} pixel of the map is drawn." if places.stride > 1 else ""
+    thinned = f" Every {_ordinal(stride)} pixel of the map is drawn." if stride > 1 else ""
     if "sample_displacement" in dataset:
         return f"A layer of {sides} mm pressed onto a sample of known stiffness: the computed truth.{thinned}"
     return f"A layer of {sides} mm, its thickness measured by optical coherence tomography.{thinned}"

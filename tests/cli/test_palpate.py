@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 import pyvista
+import scipy.io
 import xarray as xr
 from PIL import Image
 
@@ -98,7 +99,7 @@ def test_palpate_from_map_to_files(tmp_path, map_file, capsys):
     said = capsys.readouterr().out
     assert "Assumed: c10, c01, bulk" in said
     assert "1 missing and filled" in said
-    assert f"{numbers['pressure_mean_kPa']:.3g}" in said
+    assert f"{numbers['pressure_mean_touching_kPa']:.3g}" in said
     assert "kPa" in said
 
 
@@ -135,6 +136,30 @@ def test_defaults_are_the_published_case(tmp_path, map_file, solved):
     # Half an element.
     assert float(load.thickness.steps[-1].numbers["fwhm"]) == pytest.approx(0.025)
     assert not load.correct_approach
+
+
+def test_files_for_other_programs_come_and_go_with_the_result(tmp_path, map_file, solved, loaded):
+    out = tmp_path / "o"
+    asked = ("--also", "csv", "mat", "tiff", "--pdf", "--svg")
+    assert opfem("palpate", map_file, *SMALL, *asked, "--out", out) == 0
+    drawings = {f"{name}.{kind}" for name in ("pressure", "report") for kind in ("pdf", "svg")}
+    assert set(os.listdir(out)) == {*FILES, *drawings, "result.csv", "result.tif", "result.mat"}
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert b"<svg" in (out / "pressure.svg").read_bytes()[:1000]
+    held = scipy.io.loadmat(out / "result.mat")
+    # The map as measured, neither filled nor smoothed.
+    np.testing.assert_allclose(held["measured_um"], 1e3 * np.load(map_file))
+    assert opfem("palpate", map_file, *SMALL, "--out", out, "--force") == 0
+    assert set(os.listdir(out)) == set(FILES)
+
+
+def test_warnings_are_printed_in_options_and_kept(tmp_path, map_file, solved, capsys):
+    """Noise of 10 nm, which no mesh follows."""
+    assert opfem("palpate", map_file, *SMALL, "--std", 1e-5, "--out", tmp_path / "o") == 0
+    said = "The mesh does not follow the map"
+    assert said in capsys.readouterr().out
+    numbers = json.loads((tmp_path / "o" / "summary.json").read_text(encoding="utf-8"))
+    assert [warning.partition(":")[0] for warning in numbers["warnings"]] == [said]
 
 
 def test_options_arrive(tmp_path, map_file, solved):
