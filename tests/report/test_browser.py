@@ -19,11 +19,13 @@ const at = (x, y) => {
   const box = pressure.querySelector(".nsewdrag").getBoundingClientRect(), {xaxis, yaxis} = pressure._fullLayout;
   return {clientX: box.left + xaxis.l2p(x), clientY: box.top + yaxis.l2p(y), bubbles: true, view: window};
 };
+pressure.scrollIntoView();
+const under = ({clientX, clientY}) => document.elementFromPoint(clientX, clientY);
 const mouse = (target, kind, where, buttons = 0) => target.dispatchEvent(new MouseEvent(kind, {...where, buttons}));
 const said = () => Object.fromEntries(maps.map(
   div => [div.id.replace("map-", ""), div.querySelector(".hoverlayer").textContent]));
 const point = async (x, y) => {
-  const target = pressure.querySelector(".nsewdrag");
+  const target = under(at(x, y));
   mouse(target, "mouseover", at(x, y));
   mouse(target, "mousemove", at(x, y));
   await wait(400);
@@ -38,9 +40,8 @@ const profile = () => ({
 });
 const found = {shown: await point(...PIXEL), gone: said(), hole: await point(...HOLE), first: profile()};
 
-const circles = pressure.querySelectorAll(".shapelayer circle"), {x0, y0} = pressure.layout.shapes[0];
-const there = at(...PIXEL);
-mouse(circles[circles.length - 2], "mousedown", at(x0, y0), 1);
+const {x0, y0} = pressure.layout.shapes[0], there = at(...PIXEL);
+mouse(under(at(x0, y0)), "mousedown", at(x0, y0), 1);
 mouse(document, "mousemove", there, 1);
 await wait(100);
 mouse(document, "mouseup", there);
