@@ -16,6 +16,11 @@ STATUS = ("open", "sticks", "slips")
 OPEN = 0
 MOST_PIXELS = 256
 """Pixels of a map along one axis: eight maps of that many take 2.5 MB of the page."""
+_HOW = {
+    "measured": "as measured",
+    "pressed in": "filled and smoothed as the computation took it",
+    "as it would be measured": "with the noise of a microscope",
+}
 # Percentile of the size at the ends of the residual's colours, so that a few pixels do not set them.
 _OFF = 99.5
 
@@ -72,7 +77,7 @@ def report_maps(dataset: xr.Dataset, pixels: xr.Dataset, was_measured: bool) -> 
     compression = 100.0 * pixels["compression"].values
     clear = pixels["contact_status"].values == OPEN
     return [
-        _thickness(pixels, was_measured),
+        _thickness(pixels, was_measured, "sample_displacement" in dataset),
         _map(
             pixels,
             "compression",
@@ -107,14 +112,14 @@ def _map(
     return ReportMap(key, title, unit, words, *axes, values, kind, unmeasured=missing, **more)
 
 
-def _thickness(pixels: xr.Dataset, was_measured: bool) -> ReportMap:
+def _thickness(pixels: xr.Dataset, was_measured: bool, simulated: bool) -> ReportMap:
     if "measured" not in pixels:
         words = "From the window to the sample, as computed; this result does not hold the measured map."
         return _map(
             pixels, "thickness", "Thickness, computed", "µm", words, UM * pixels["thickness"].values, "thickness"
         )
-    how, done = ("as measured", "measured") if was_measured else ("as it was pressed in", "pressed in")
-    words = f"From the window to the sample under load, {how}."
+    done = "pressed in" if not was_measured else "as it would be measured" if simulated else "measured"
+    words = f"From the window to the sample under load, {_HOW[done]}."
     return _map(pixels, "thickness", f"Thickness, {done}", "µm", words, UM * pixels["measured"].values, "thickness")
 
 

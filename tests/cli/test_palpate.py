@@ -121,6 +121,31 @@ def test_fit_from_map_to_files(tmp_path, map_file, spread):
     assert pyvista.read(out / "result.vtu").n_cells == 72
 
 
+def test_report_says_what_was_given_and_what_assumed(tmp_path, map_file, solved):
+    given = ("--c10", "0.003", "--bulk", "0.2", "--window-friction=0.15", "--elements", "6", "6", "2")
+    assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.5, *given, "--out", tmp_path / "a") == 0
+    attrs = op.read_netcdf(tmp_path / "a" / "result.nc").attrs
+    assert (
+        attrs["command"] == f"opfem palpate {map_file} --extent 2 2 --l0 0.5 {' '.join(given)} --out {tmp_path / 'a'}"
+    )
+    assumed = set(json.loads(attrs["assumed"]))
+    assert {"layer.material.c01", "sample.friction", "sample.law.pressure", "smooth", "element"} <= assumed
+    assert not {"layer.material.c10", "layer.material.bulk", "window.friction", "elements"} & assumed
+    page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    assert "Assumed, because nobody said otherwise. Layer: sides, C01; Window: contact law; Sample: contact law" in page
+    assert attrs["command"] in page
+
+
+def test_no_report(tmp_path, map_file, solved):
+    assert opfem("palpate", map_file, *SMALL, "--no-report", "--out", tmp_path / "a") == 0
+    assert sorted(os.listdir(tmp_path / "a")) == sorted(set(FILES) - {"report.html"})
+    # One that is replaced goes with the rest of its result.
+    assert opfem("palpate", map_file, *SMALL, "--force", "--out", tmp_path / "a") == 0
+    assert (tmp_path / "a" / "report.html").is_file()
+    assert opfem("palpate", map_file, *SMALL, "--no-report", "--force", "--out", tmp_path / "a") == 0
+    assert not (tmp_path / "a" / "report.html").exists()
+
+
 def test_defaults_are_the_published_case(tmp_path, map_file, solved):
     assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.5, "--out", tmp_path / "o") == 0
     palpation, load, solver = solved[0]

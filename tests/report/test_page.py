@@ -179,6 +179,10 @@ def test_experiment(truth, tmp_path):
     found = rows(page)
     assert [cells[0] for cells in found["friction coefficient"]] == ["Window", "Layer on sample", "Plate"]
     assert found["approach of plate and window"][0][2] == "0.2 mm"
+    seen = op.measured_thickness(truth, spacing=0.1, std=1e-3, seed=1)
+    page = written(truth, tmp_path / "seen.html", seen)
+    assert "Thickness, as it would be measured" in words(page)
+    assert "map-residual" not in plots(page)  # it would be the noise
 
 
 def test_energies_over_time_are_drawn(dataset, page, tmp_path):
