@@ -208,7 +208,10 @@ def _write(
         progress.stage("pictures")
         from ..plot import draw_pictures, draw_simulation
 
-        dataset = with_record(to_xarray(solution), [], numbers["deck"]["assumed"], numbers["warnings"])
+        said = numbers["deck"]["assumed"]
+        # The sentences name materials, not bodies: of two with one open, both are marked.
+        bulk = [f"{body}.material.bulk" for body in ("layer", "sample") if any("D = 0" in part for part in said)]
+        dataset = with_record(to_xarray(solution), bulk, said, numbers["warnings"])
         if before is not None:
             dataset[INCREMENT] = axial_increment(solution, before)
         if isinstance(solution, Solution):

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from .convergence import imbalance, small_percent
-from .inputs import ASSUMED, Input
+from .inputs import ASSUMED, Input, assumptions
 from .maps import KPA
 from .numbers import compression, mean_pressure, touching_share
 
@@ -74,7 +74,7 @@ def checks(dataset: xr.Dataset, pixels: xr.Dataset, inputs: list[Input]) -> list
         *(Check(False, warning) for warning in json.loads(attrs.get(WARNINGS, "[]"))),
         *_fit(dataset),
         *_missing(pixels),
-        *_inputs(inputs, ASSUMED in attrs),
+        *_inputs(inputs, assumptions(dataset), ASSUMED in attrs),
     ]
 
 
@@ -95,10 +95,10 @@ def _missing(pixels: xr.Dataset) -> list[Check]:
     return [Check(True, f"{words}; what is computed there rests on its surroundings.")]
 
 
-def _inputs(inputs: list[Input], recorded: bool) -> list[Check]:
+def _inputs(inputs: list[Input], sentences: list[str], recorded: bool) -> list[Check]:
     physical = [row for row in inputs if row.mark == "assumed" and row.part not in _NUMERICAL]
     by_part = {row.part: ", ".join(r.name.split(",")[0] for r in physical if r.part == row.part) for row in physical}
-    if physical:
-        words = "; ".join(f"{part}: {names}" for part, names in by_part.items())
+    if physical or sentences:
+        words = "; ".join([*(f"{part}: {names}" for part, names in by_part.items()), *sentences])
         return [Check(False, f"Assumed, because nobody said otherwise. {words}. Are they yours?")]
     return [Check(True, "Every input was given.")] if recorded else []

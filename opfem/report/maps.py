@@ -18,7 +18,7 @@ MOST_PIXELS = 256
 """Pixels of a map along one axis: eight maps of that many take 2.5 MB of the page."""
 _HOW = {
     "measured": "as measured",
-    "pressed in": "filled and smoothed as the computation took it",
+    "pressed in": "as the computation took it",
     "as it would be measured": "with the noise of a microscope",
 }
 # Percentile of the size at the ends of the residual's colours, so that a few pixels do not set them.

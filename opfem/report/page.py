@@ -97,7 +97,7 @@ def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> b
         title=escape(_heading(dataset)),
         css=_packaged("page.css"),
         heading=escape(_heading(dataset)),
-        subtitle=escape(_subtitle(dataset, stride_of(pixels))),
+        subtitle=escape(_subtitle(dataset, stride_of(pixels), measured is not None)),
         short=escape(in_short(dataset, pixels)),
         checks="".join(
             f'<li class="{"good" if check.good else "care"}">{escape(check.words)}</li>'
@@ -167,12 +167,13 @@ def _heading(dataset: xr.Dataset) -> str:
     return str(dataset.attrs.get("title", "Stress on the sample"))
 
 
-def _subtitle(dataset: xr.Dataset, stride: int) -> str:
+def _subtitle(dataset: xr.Dataset, stride: int, was_measured: bool) -> str:
     sides = " × ".join(f"{side:g}" for side in dataset.attrs["extent"])
     thinned = f" Every {_ordinal(stride)} pixel of the map is drawn." if stride > 1 else ""
     if "sample_displacement" in dataset:
         return f"A layer of {sides} mm pressed onto a sample of known stiffness: the computed truth.{thinned}"
-    return f"A layer of {sides} mm, its thickness measured by optical coherence tomography.{thinned}"
+    seen = ", its thickness measured by optical coherence tomography" if was_measured else ""
+    return f"A layer of {sides} mm{seen}.{thinned}"
 
 
 def _ordinal(number: int) -> str:
