@@ -22,6 +22,7 @@ from .options import (
     LayerOptions,
     MapOptions,
     MicroscopeOptions,
+    PictureOptions,
     ResultOptions,
     RunOptions,
     SolverOptions,
@@ -133,16 +134,17 @@ def sweep(
     *,
     out: _Out,
     resume: Annotated[bool, Parameter(help="Go on with the sweep that --out holds.")] = False,
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve for many values of materials, frictions and thickness, as CONFIG says.
 
-    Writes result.nc, labelled by the axes, and every finished point on the way.
+    Writes result.nc, labelled by the axes, its numbers as table.csv and sweep.png, and every finished point on the way.
     """
     from .sweep import sweep
 
     with reporting(run.debug):
-        sweep(config, out, resume, run)
+        sweep(config, out, resume, run, files)
 
 
 @app.command

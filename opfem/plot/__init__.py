@@ -15,6 +15,7 @@ from .oct import draw_interface, plot_interface
 from .phase import draw_displacement, plot_displacement
 from .reports import draw_fit, draw_pictures, plot_fit, plot_report
 from .scene import plot_layer
+from .sweep import draw_sweep
 
 __all__ = [
     "draw_calibration",
@@ -24,6 +25,7 @@ __all__ = [
     "draw_interface",
     "draw_pictures",
     "draw_simulation",
+    "draw_sweep",
     "plot_calibration",
     "plot_comparison",
     "plot_compression",

@@ -17,7 +17,7 @@ _SIZE = (6.4, 5.6)  # inches
 _BAND = 2.0  # standard deviations drawn
 _BEYOND = 0.25  # of the range of strain, drawn dashed beyond it
 _POINTS = 200
-_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 
 
 def plot_calibration(calibration: Calibration, figure: Figure | None = None) -> np.ndarray:
@@ -54,7 +54,7 @@ def draw_calibration(calibration: Calibration) -> Figure:
 
 
 def _draw_curve(calibration: Calibration, number: int, stretch: np.ndarray, axes: Any) -> None:
-    colour = _COLOURS[number % len(_COLOURS)]
+    colour = COLOURS[number % len(COLOURS)]
     mode = calibration.curves.modes[number]
     offset = float(calibration.offset[number]) if calibration.offset.size else 0.0
     at = stretch / (1.0 + offset) if calibration.model.toe == "strain" else stretch
