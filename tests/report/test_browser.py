@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import opfem as op
+from opfem import cli
 from tests.report.browser import CHROMIUM, run_in_page
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium; `apt install chromium` brings it")
@@ -58,11 +59,6 @@ const layer = document.getElementById("layer");
 found.layer = {width: layer.querySelector("canvas").width, faces: layer.data.length};
 return found;
 """
-
-
-@pytest.fixture(scope="module")
-def dataset(solution):
-    return op.to_xarray(solution)
 
 
 @pytest.fixture(scope="module")
@@ -128,3 +124,52 @@ def test_zoom_is_shared(found):
 def test_layer_is_drawn_in_three_dimensions(found):
     assert found["layer"]["width"] > 300
     assert found["layer"]["faces"] == 6
+
+
+# What any report shows once it is drawn: maps of one size, curves with values, the layer.
+_LOOK = """
+const maps = [...document.querySelectorAll(".plot.map")];
+const drawn = maps.map(div => div.querySelector(".plot .xy, .cartesianlayer .plot").getBoundingClientRect());
+return {
+  names: maps.map(div => div.id.replace("map-", "")),
+  sizes: drawn.map(({width, height}) => [Math.round(width), Math.round(height)]),
+  curves: document.getElementById("section").data.map(({y}) => y.filter(value => value !== null).length),
+  layer: document.querySelector("#layer canvas").width,
+};
+"""
+IMPRINT = ["thickness", "compression", "pressure", "status", "window_status", "residual"]
+
+
+def looked_at(page, scratch, expected):
+    told = run_in_page(page, _LOOK, scratch)
+    assert told["complaints"] == told["requests"] == []
+    found = told["found"]
+    assert found["names"] == expected
+    assert len({tuple(size) for size in found["sizes"]}) == 1
+    assert min(found["curves"]) > 200
+    assert found["layer"] > 300
+
+
+def test_fit_opens(fitted, loaded, tmp_path):
+    op.write_report(fitted, tmp_path / "report.html", loaded)
+    looked_at(tmp_path / "report.html", tmp_path, [*IMPRINT[:3], "uncertainty", *IMPRINT[3:]])
+
+
+def test_experiment_opens(truth, tmp_path):
+    op.write_report(truth, tmp_path / "report.html")
+    looked_at(tmp_path / "report.html", tmp_path, IMPRINT[:-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["example", "coin"])
+def test_report_of_a_command_opens(which, tmp_path, request):
+    map = "example"
+    if which == "coin":
+        map = request.getfixturevalue("shared") / "data" / "coin_5c_1-thickness.mat"
+    given = ("--extent", "5", "5", "--l0", "0.5") if which == "coin" else ()
+    with pytest.raises(SystemExit) as end:
+        cli.main(["palpate", str(map), *given, "--out", str(tmp_path / "out")])
+    assert end.value.code == 0
+    page = tmp_path / "out" / "report.html"
+    assert 5e6 < page.stat().st_size < 8e6
+    looked_at(page, tmp_path, IMPRINT)

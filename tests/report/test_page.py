@@ -20,11 +20,6 @@ PARTS = (
 
 
 @pytest.fixture(scope="module")
-def dataset(solution):
-    return op.to_xarray(solution)
-
-
-@pytest.fixture(scope="module")
 def page(dataset, loaded, tmp_path_factory):
     return written(dataset, tmp_path_factory.mktemp("report") / "report.html", loaded)
 
@@ -201,17 +196,7 @@ def test_energies_over_time_are_drawn(dataset, page, tmp_path):
     assert rows(page)["Kinetic energy"][0][1:3] == ["0.4", "%"]
 
 
-def test_fit_shows_its_uncertainty(dataset, loaded, tmp_path):
-    prior = json.dumps({"class": "Matern", "length": 0.5, "std": 2e-3})
-    fitted = dataset.drop_vars("residual").assign(
-        pressure_std=0.1 * dataset["pressure"],
-        residual=(("y", "x"), np.full(dataset["pressure"].shape, -2e-3)),
-        reduced_chi2=((), 3.0),
-        resolution_width=("resolution_point", [0.2, 0.3, 0.4]),
-        model_std=((), 1e-3),
-        **dict.fromkeys(("forward_solves", "inner_iterations", "std_error", "draws"), ((), 3.0)),
-    )
-    fitted = fitted.assign(misfit_rms=((), 2e-3)).assign_attrs(fit_status="successful", fit_message="", prior=prior)
+def test_fit_shows_its_uncertainty(fitted, loaded, tmp_path):
     page = written(fitted, tmp_path / "report.html", loaded)
     drawn, found = plots(page), rows(page)
     assert "map-uncertainty" in drawn
