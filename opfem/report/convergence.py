@@ -51,12 +51,7 @@ def convergence_rows(dataset: xr.Dataset) -> list[Row]:
         Row("Ended", str(attrs["status"]).replace("_", " "), "", attrs.get("status_message") or "without remarks"),
         Row("Load reached", f"{100 * float(dataset['load_fraction']):.0f}", "%", "of the load that was asked for"),
         Row("Forces out of balance", small_percent(imbalance(dataset)), "%", "of the force of the sample"),
-        Row(
-            "Increments, Newton steps",
-            f"{int(dataset['increments'])}, {int(dataset['newton_steps'])}",
-            "",
-            "friction depends on the path, so the load is applied in increments",
-        ),
+        _increments(dataset),
         Row("Smallest volume ratio", f"{float(dataset['min_volume_ratio']):.3f}", "", "1 keeps its volume"),
         Row("Largest penetration", f"{1e3 * float(dataset['max_penetration']):.2g}", "µm", "of the faces in contact"),
         *_energy(dataset),
@@ -78,6 +73,14 @@ def convergence_rows(dataset: xr.Dataset) -> list[Row]:
             ),
         ]
     return rows
+
+
+def _increments(dataset: xr.Dataset) -> Row:
+    count = int(dataset["increments"])
+    if "kinetic_ratio" in dataset:
+        return Row("Time increments", f"{count}", "", "of explicit dynamics, each no longer than is stable")
+    words = "friction depends on the path, so the load is applied in increments"
+    return Row("Increments, Newton steps", f"{count}, {int(dataset['newton_steps'])}", "", words)
 
 
 def _energy(dataset: xr.Dataset) -> list[Row]:

@@ -14,14 +14,23 @@ from plotly.colors import get_colorscale
 from .figures import FONT
 from .maps import KPA
 
-STRETCH_Z = 3.0
-"""How much the picture is stretched along the thickness; a layer is ten times as wide as it is thick."""
+_THICK = 0.3  # thickness in the picture, over the longer side, that a thinner layer is stretched to
 _SIDE = "#9fb6c4"
 _BAR: dict[str, Any] = {
     "title": {"text": "pressure on the sample [kPa]", "side": "top"}, "orientation": "h", "thickness": 12, "len": 0.7,
     "outlinewidth": 0, "y": 0.0, "yanchor": "top",
 }  # fmt: skip
 _MOST_NODES = 200  # along one axis; more are thinned out
+
+
+def stretch(dataset: xr.Dataset) -> float:
+    """Say how much the picture is stretched along the thickness: a layer is some ten times as wide as it is thick.
+
+    Args:
+        dataset: What `to_xarray` returned.
+    """
+    longest = float(max(np.ptp(dataset["x"].values), np.ptp(dataset["y"].values)))
+    return max(1.0, round(_THICK * longest / float(dataset["unloaded_thickness"].max()), 1))
 
 
 def layer_figure(dataset: xr.Dataset) -> go.Figure:
@@ -39,7 +48,7 @@ def layer_figure(dataset: xr.Dataset) -> go.Figure:
         figure.add_trace(_side(sheet))
     figure.add_trace(_rim(points[:, 0]))
     spans = [float(np.ptp(axis)) for axis in points]
-    ratio = dict(zip("xyz", (spans[0], spans[1], STRETCH_Z * spans[2]), strict=True))
+    ratio = dict(zip("xyz", (spans[0], spans[1], stretch(dataset) * spans[2]), strict=True))
     longest = max(ratio.values())
     axis: dict[str, Any] = {"backgroundcolor": "white", "gridcolor": "#ddd", "nticks": 6, "showspikes": False}
     # Both y and z run against the scene's own axes, which turns it and mirrors nothing.

@@ -23,7 +23,7 @@ from .checks import WARNINGS, checks, in_short
 from .convergence import convergence_rows, energy_figure
 from .figures import map_figure
 from .inputs import NOT_RECORDED, assumptions, input_rows
-from .layer3d import STRETCH_Z, layer_figure
+from .layer3d import layer_figure, stretch
 from .maps import ReportMap, report_maps, stride_of
 from .numbers import number_rows
 from .provenance import PAPERS, citation, provenance_rows
@@ -108,7 +108,7 @@ def report_bytes(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> b
         maps="".join(map(_card, maps)),
         legend=_legend(maps),
         section_words=escape(_section_words(dataset)),
-        layer_words=escape(_layer_words()),
+        layer_words=escape(_layer_words(stretch(dataset))),
         numbers=number_table(number_rows(dataset, pixels)),
         inputs_words=escape(_inputs_words(any(row.mark == NOT_RECORDED for row in inputs))),
         inputs=input_table(inputs, assumptions(dataset)),
@@ -210,10 +210,10 @@ def _section_words(dataset: xr.Dataset) -> str:
     return f"Thickness is drawn from the window downwards.{band}"
 
 
-def _layer_words() -> str:
+def _layer_words(stretched: float) -> str:
     return (
         "Seen through the clear window as the microscope sees it; what stands up is where the sample presses. Coloured "
-        f"by the pressure on the sample [kPa], stretched {STRETCH_Z:g} times along its thickness. Drag to turn it; "
+        f"by the pressure on the sample [kPa], stretched {stretched:g} times along its thickness. Drag to turn it; "
         "roll the wheel to come nearer."
     )
 

@@ -132,7 +132,7 @@ def test_names_of_files_are_no_code(dataset, tmp_path):
 def test_stored_result_gives_the_same_page(page, dataset, loaded, tmp_path):
     op.write_netcdf(dataset, tmp_path / "result.nc")
     again = written(op.read_netcdf(tmp_path / "result.nc"), tmp_path / "report.html", loaded)
-    undated = re.compile(r"Report written</th><td>[^<]*")
+    undated = re.compile(r"Report written</th><td[^>]*>[^<]*")
     assert undated.sub("", again) == undated.sub("", page)
 
 
@@ -194,6 +194,7 @@ def test_energies_over_time_are_drawn(dataset, page, tmp_path):
     assert drawn["layout"]["yaxis"]["title"]["text"] == "energy [µJ]"
     assert 'id="energy"' in page
     assert rows(page)["Kinetic energy"][0][1:3] == ["0.4", "%"]
+    assert rows(page)["Time increments"][0][1] == f"{int(dataset['increments'])}"
 
 
 def test_fit_shows_its_uncertainty(fitted, loaded, tmp_path):
