@@ -45,7 +45,7 @@ def in_short(dataset: xr.Dataset, pixels: xr.Dataset) -> str:
     if not share:
         return "The layer touches the sample nowhere: there is no pressure."
     sure = (
-        f" ± {KPA * float(dataset['pressure_std'].mean()):.2g} kPa (one standard deviation)"
+        f" (one place is known to ± {KPA * float(dataset['pressure_std'].mean()):.2g} kPa, one standard deviation)"
         if "pressure_std" in dataset
         else ""
     )
