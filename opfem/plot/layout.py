@@ -94,8 +94,11 @@ def draw_page(
         draw(ax)
         ax.set_title(title, fontsize="medium")
         ax.set(xlim=limits[:2], ylim=limits[:1:-1])
-    for ax in axes[: len(panels)]:
+    for place, ax in enumerate(axes[: len(panels)]):
         ax.label_outer()
+        if place + columns >= len(panels):  # nothing is drawn below
+            ax.tick_params(labelbottom=True)
+            ax.set_xlabel("x [mm]")
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     _common_key(figure, axes)
