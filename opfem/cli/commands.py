@@ -224,6 +224,7 @@ def oct(
     reading: VolumeOptions = VolumeOptions(),
     microscope: MicroscopeOptions = MicroscopeOptions(),
     asked: InterfaceOptions = InterfaceOptions(),
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Measure the thickness of the layer in an OCT volume, or the displacement between two.
@@ -239,9 +240,9 @@ def oct(
         if (loaded is None) == (phase is None):
             raise ValueError("opfem oct takes either LOADED or --phase BEFORE AFTER.")
         if phase is not None:
-            return measure_phase(phase, out, reading, microscope, run)
+            return measure_phase(phase, out, reading, microscope, run, files)
         assert loaded is not None
-        measure(loaded, out, unloaded, l0, reading, microscope, asked, run)
+        measure(loaded, out, unloaded, l0, reading, microscope, asked, run, files)
 
 
 @app.command
@@ -252,6 +253,7 @@ def calibrate(
     out: _Out,
     reading: CurveOptions = CurveOptions(),
     asked: LawOptions = LawOptions(),
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit a material law to stress–strain curves, and say what they can and cannot tell.
@@ -261,7 +263,7 @@ def calibrate(
     from .calibrate import run_calibration
 
     with reporting(run.debug):
-        run_calibration(list(curves), out, reading, asked, run)
+        run_calibration(list(curves), out, reading, asked, run, files)
 
 
 @app.command

@@ -16,21 +16,19 @@ from ..io import MAP_FILES, finish, netcdf_bytes, vtu_bytes, whole_file, write_t
 from ..measurement import ThicknessMap
 from ..sweeps.store import PLAN
 from .options import ResultOptions
-from .output import DRAWINGS, REPORT, exports, pictures
+from .output import REPORT, exports, pictures, with_drawings
 
 # The mark of a finished result comes last: a folder that holds it holds a whole result.
 FINISHED = "result.nc"
 EXAMPLE = "example_map.npz"
 SIMULATED, UNLOADED = "map.npz", "l0.npz"
 DECK_PICTURE = "deck.png"
-_PICTURES = [f"{name}{suffix}" for name in ("pressure", "report", "fit", "section") for suffix in (".png", *DRAWINGS)]
-_EXPORTS = [REPORT, *(f"result{suffix}" for suffix, _ in MAP_FILES.values())]
+_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png")
+_EXPORTS = (REPORT, *(f"result{suffix}" for suffix, _ in MAP_FILES.values()))
 # All that `palpate`, `fit` and `simulate` write.
 RESULT = (
-    *(EXAMPLE, SIMULATED, UNLOADED, "result.vtu"),
-    *_EXPORTS,
-    *(*_PICTURES, DECK_PICTURE),
-    *("summary.json", FINISHED),
+    *(EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_EXPORTS),
+    *(*with_drawings(_PICTURES), DECK_PICTURE, "summary.json", FINISHED),
 )
 
 

@@ -1,7 +1,7 @@
 """What a command writes on top of its result, where asked: pictures as drawings, and maps for other programs."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import xarray as xr
@@ -13,8 +13,14 @@ from .messages import in_options
 from .options import PictureOptions, ResultOptions
 
 _DPI = 200
-DRAWINGS = (".pdf", ".svg")
+_DRAWINGS = (".pdf", ".svg")
 REPORT = "report.html"
+
+
+def with_drawings(names: Sequence[str]) -> tuple[str, ...]:
+    """Name the files that a result may have where its pictures may be drawings, too."""
+    drawings = [name.removesuffix(".png") + suffix for name in names if name.endswith(".png") for suffix in _DRAWINGS]
+    return (*drawings, *names)
 
 
 def pictures(figures: Mapping[str, Any], asked: PictureOptions) -> dict[str, bytes]:
@@ -24,7 +30,7 @@ def pictures(figures: Mapping[str, Any], asked: PictureOptions) -> dict[str, byt
         figures: Matplotlib figures by file name, which ends in .png.
         asked: Which drawings.
     """
-    wanted = [".png", *(suffix for suffix in DRAWINGS if getattr(asked, suffix[1:]))]
+    wanted = [".png", *(suffix for suffix in _DRAWINGS if getattr(asked, suffix[1:]))]
     contents = {}
     for name, figure in figures.items():
         for suffix in wanted:

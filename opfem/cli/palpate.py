@@ -65,6 +65,7 @@ def palpate(
             record_failure({**summary(failure.solution), "settings": settings}, out)
             kept = f" {out} keeps its finished result." if (out / FINISHED).exists() else ""
             raise ConvergenceError(f"{failure}{kept}", failure.solution) from None
+        progress.stage("summary")
         numbers = {**summary(solution, measured), "settings": settings}
         written = write_results(solution, measured, numbers, out, files, is_example=map == "example")
     _show_results(numbers, written, out)

@@ -30,13 +30,13 @@ from ..sweeps.store import FINISHED, PLAN, POINTS, TABLE
 from .folder import prepare, refuse_links
 from .messages import in_options, validators
 from .options import ImprintOptions, LayerOptions, MapOptions, PictureOptions, RunOptions
-from .output import DRAWINGS, pictures
+from .output import pictures, with_drawings
 from .statement import configure_jax, read_maps, state_experiment, state_palpation
 from .toml_file import converted, read_toml
 
 PICTURE = "sweep.png"
 # All that a sweep writes, the mark of a finished one last.
-RESULT = (POINTS, PLAN, TABLE, *(f"sweep{suffix}" for suffix in (".png", *DRAWINGS)), FINISHED)
+RESULT = (POINTS, PLAN, TABLE, *with_drawings((PICTURE,)), FINISHED)
 # Where a sweep is computed that is to take the place of the one in the folder around it.
 _REPLACEMENT = ".opfem-replacement"
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from ..measurement import ThicknessMap
 from . import layout
+from .calibration import COLOURS
 
 _SIDE_HEIGHT, _SIDE_WIDTH = 2.6, 8.0  # inch
 _MOST_MAPS = 4
@@ -32,7 +33,7 @@ def draw_deck(
     grids = [(np.asarray(thickness.x), np.asarray(thickness.y)) for thickness in shown.values()]
     limits = layout.together(*(layout.pixel_limits(*grid) for grid in grids)) if grids else None
     width, height = (0.0, 0.0) if limits is None else layout.page(len(grids), limits)[1]
-    figure = Figure(figsize=(max(width, _SIDE_WIDTH), _SIDE_HEIGHT + height), layout="compressed")
+    figure = Figure(figsize=(max(width, _SIDE_WIDTH), _SIDE_HEIGHT + height), layout="constrained")
     if limits is None:
         _draw_side(sections, title, figure.subplots())
         return figure
@@ -46,7 +47,9 @@ def draw_deck(
 
 def _draw_side(sections: Mapping[str, np.ndarray], title: str, side: Axes) -> None:
     for number, (name, corners) in enumerate(sections.items()):
-        side.add_collection(PolyCollection(list(corners), facecolor=f"C{number}", edgecolor="k", lw=0.2, label=name))
+        side.add_collection(
+            PolyCollection(list(corners), facecolor=COLOURS[number % len(COLOURS)], edgecolor="k", lw=0.2, label=name)
+        )
     side.autoscale_view()
     side.set(xlabel="x [mm]", ylabel="z [mm]", title=title)
     side.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)

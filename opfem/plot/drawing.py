@@ -60,7 +60,7 @@ class Drawn:
         """Current y of interface nodes [mm]."""
         return self.dataset["y_current"].values
 
-    @property
+    @cached_property
     def grid(self) -> tuple[Float[np.ndarray, " px"], Float[np.ndarray, " py"]]:
         """Positions of columns and rows of the measured map, or of the load's [mm]."""
         if self.measured is not None:
@@ -77,7 +77,7 @@ class Drawn:
         x, y = self.grid
         return np.zeros((y.size, x.size), bool)
 
-    @property
+    @cached_property
     def limits(self) -> layout.Limits:
         """What holds the layer where it is now, and the map."""
         return layout.together(layout.limits_of(self.x, self.y), layout.pixel_limits(*self.grid))

@@ -20,7 +20,7 @@ from . import layout
 from .drawing import DIVERGING, Drawn, draw_compression, draw_pressure, draw_status, draw_thickness
 
 _KPA = 1e3
-_SECTION_SIZE = (8.0, 4.4)  # inches
+_SECTION_WIDTH, _BESIDE, _ABOVE = 8.0, 1.6, 1.1  # inches; room beside and above the bodies for labels
 _LABELS = {"stress_zz": "−σ_zz, compression [kPa]", "mises": "von Mises stress [kPa]"}
 _LEAST_ERROR = 1e-6  # kPa at the ends of the colours: below is round-off
 _SAME = 1e-6  # difference of shear moduli that is none, relative
@@ -70,7 +70,7 @@ def plot_section(
     sample, sample_stress = _cut(dataset, y, "sample_", "y_sample", "sample_element_stress", colour)
     both = np.concatenate([layer_stress.ravel(), sample_stress.ravel()])
     limits = (min(0.0, float(both.min())), float(np.percentile(both, 99.5)) if vmax is None else vmax)
-    ax = layout.shown_figure(_SECTION_SIZE).subplots() if ax is None else ax
+    ax = layout.shown_figure(_section_size(dataset)).subplots() if ax is None else ax
     style: Any = {"cmap": cmap, "vmin": limits[0], "vmax": limits[1], "edgecolors": (0, 0, 0, 0.15), "linewidth": 0.2}
     for nodes, stress in ((layer, layer_stress), (sample, sample_stress)):
         colours = ax.pcolormesh(nodes[0], nodes[1], stress, shading="flat", **style)
@@ -80,7 +80,7 @@ def plot_section(
     for height in (0.0, plate):
         ax.axhline(height, color="black", linewidth=2.5)
     extend = "max" if both.max() > limits[1] else "neither"
-    ax.figure.colorbar(colours, ax=ax, label=_LABELS[colour], extend=extend, shrink=0.8)
+    ax.figure.colorbar(colours, ax=ax, label=_LABELS[colour], extend=extend, fraction=0.04, pad=0.02)
     room = 0.05 * plate
     ax.set(
         xlabel="x [mm]", ylabel="z [mm]", ylim=(plate + room, -room), aspect="equal", title=f"Section at y = {y:.3g} mm"
@@ -127,7 +127,7 @@ def draw_simulation(data: xr.Dataset, measured: ThicknessMap, y: float | None = 
         measured: The map as it would be measured.
         y: Where to cut [mm]; None takes the middle.
     """
-    section = Figure(figsize=_SECTION_SIZE, layout="compressed")
+    section = Figure(figsize=_section_size(data), layout="compressed")
     plot_section(data, section.subplots(), y=y)
     drawn = Drawn(data, measured)
     panels = {
@@ -140,6 +140,12 @@ def draw_simulation(data: xr.Dataset, measured: ThicknessMap, y: float | None = 
     report = layout.empty_page(len(panels), drawn.limits)
     layout.draw_page(panels, drawn.limits, report)
     return {"section.png": section, "report.png": report}
+
+
+def _section_size(dataset: xr.Dataset) -> tuple[float, float]:
+    """Find the size of a picture [inch] that both bodies fill."""
+    height = float(dataset["sample_height"].values.max() / np.ptp(dataset["x_sample"].values))
+    return _SECTION_WIDTH, height * (_SECTION_WIDTH - _BESIDE) + _ABOVE
 
 
 def _cut(

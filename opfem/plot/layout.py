@@ -23,6 +23,7 @@ Limits = tuple[float, float, float, float]
 _PANEL_AREA, _LOWEST_PANEL = 10.0, 2.0  # of a map, and its least height, which a label takes
 _BESIDE, _ABOVE = 1.2, 0.35  # room for a map's colour bar, and for its title
 _LEFT, _BELOW = 0.4, 0.85  # room for the labels of the outer axes, and below them for the key
+_BAR = (1.03, 0.0, 0.05, 1.0)  # place of the colour bar beside a map, in parts of the map's width and height
 _KEY_BELOW = 0.45  # the key of a single map, below its axis
 _PAGE = math.sqrt(2.0)  # width over height that a page of maps comes near
 _EMPTY = 3.0  # what an empty place counts, in logarithms of that ratio over the part of the places
@@ -93,8 +94,11 @@ def draw_page(
         draw(ax)
         ax.set_title(title, fontsize="medium")
         ax.set(xlim=limits[:2], ylim=limits[:1:-1])
-    for ax in axes[: len(panels)]:
+    for place, ax in enumerate(axes[: len(panels)]):
         ax.label_outer()
+        if place + columns >= len(panels):  # nothing is drawn below
+            ax.tick_params(labelbottom=True)
+            ax.set_xlabel("x [mm]")
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     _common_key(figure, axes)
@@ -124,8 +128,8 @@ def orient(ax: Axes, limits: Limits) -> None:
 
 
 def colour_bar(ax: Axes, colours: ScalarMappable, label: str, extend: str) -> Colorbar:
-    """Put a colour bar beside a map."""
-    return ax.figure.colorbar(colours, ax=ax, label=label, extend=extend)
+    """Put a colour bar beside a map, as high as the map is drawn."""
+    return ax.figure.colorbar(colours, cax=ax.inset_axes(_BAR), label=label, extend=extend)
 
 
 def image(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from ..measurement import ThicknessMap
 from ..measurement.oct import Interface, OctVolume
@@ -24,7 +25,7 @@ _MOST_COLUMNS = 800
 
 
 def plot_interface(volume: OctVolume, interface: Interface, figure: Figure | None = None) -> np.ndarray:
-    """Draw nine B-scans with the interface (orange, and a band of two standard deviations; red dots: masked).
+    """Draw nine B-scans with the interface (orange, and a band of two standard deviations; blue dots: masked).
 
     Args:
         volume: The volume.
@@ -54,8 +55,9 @@ def plot_interface(volume: OctVolume, interface: Interface, figure: Figure | Non
         depth, std = _UM * np.asarray(interface.depth)[row], _UM * np.asarray(interface.std)[row]
         known = np.where(kept[row], depth, np.nan)
         ax.fill_between(x, known - _BAND * std, known + _BAND * std, color="#e69f00", alpha=0.35, linewidth=0)
-        ax.plot(x, known, color="#e69f00", linewidth=0.8)
-        ax.plot(x[~kept[row]], depth[~kept[row]], ".", color="#d62728", markersize=1.5)
+        # Its dark rim keeps the line apart from the sample in a grey print.
+        ax.plot(x, known, color="#e69f00", linewidth=0.8, path_effects=[withStroke(linewidth=2.0, foreground="black")])
+        ax.plot(x[~kept[row]], depth[~kept[row]], ".", color="#56b4e9", markersize=2.5)
         ax.set(title=f"y = {y[row]:.2f} mm", xlim=(x[0], x[-1]), ylim=(depths[levels][-1], depths[0]))
     for ax in axes[-1]:
         ax.set_xlabel("x [mm]")

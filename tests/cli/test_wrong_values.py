@@ -110,7 +110,7 @@ TABLE = {
     "deck": [*DECK, *FILES, *FLAGS, *OUT],
     "fit": [*MAPS, *LAYER, *CONTACT, *FIT, *SOLVER[1:3], *FILES, *FLAGS, *OUT],
     "demo": [*SOLVER, *FILES, *FLAGS, *OUT, ("--coin=maybe", None, None, "must be given without a value", "'maybe'")],
-    "sweep": [*FLAGS, *OUT, ("--resume=maybe", None, None, "must be given without a value", "'maybe'")],
+    "sweep": [*FILES[1:3], *FLAGS, *OUT, ("--resume=maybe", None, None, "must be given without a value", "'maybe'")],
 }
 ROWS = [(command, *row) for command, rows in TABLE.items() for row in rows]
 CONFIG = (

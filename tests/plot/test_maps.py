@@ -24,7 +24,8 @@ def dataset(solution):
 
 
 def colour_bar(ax):
-    return next(other for other in ax.figure.axes if other is not ax)
+    (bar,) = ax.child_axes
+    return bar
 
 
 def render(figure) -> np.ndarray:
