@@ -40,10 +40,13 @@ from .io import (
     read_spectra as read_spectra,
     read_stress_strain as read_stress_strain,
     read_thickness as read_thickness,
+    write_csv as write_csv,
+    write_mat as write_mat,
     write_netcdf as write_netcdf,
     write_oct as write_oct,
     write_pvd as write_pvd,
     write_thickness as write_thickness,
+    write_tiff as write_tiff,
     write_vtu as write_vtu,
 )
 from .measurement import (
@@ -100,6 +103,7 @@ from .model import (
 from .plot import (
     plot_calibration as plot_calibration,
     plot_comparison as plot_comparison,
+    plot_compression as plot_compression,
     plot_displacement as plot_displacement,
     plot_fit as plot_fit,
     plot_interface as plot_interface,
@@ -112,6 +116,7 @@ from .plot import (
     plot_thickness as plot_thickness,
     plot_uncertainty as plot_uncertainty,
 )
+from .report import write_report as write_report
 from .results import (
     Comparison as Comparison,
     OctScene as OctScene,
@@ -119,6 +124,7 @@ from .results import (
     layer_fields as layer_fields,
     measured_thickness as measured_thickness,
     oct_scene as oct_scene,
+    on_pixels as on_pixels,
     sample_fields as sample_fields,
     summary as summary,
     to_xarray as to_xarray,

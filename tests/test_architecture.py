@@ -24,6 +24,7 @@ MAY_IMPORT |= {
     "compilation": set(),
     "io": {"io", "measurement", "model", "results"},
     "plot": {"plot", "io", "measurement", "results"},
+    "report": {"report", "io", "measurement", "results"},
     "datasets": {"datasets", "io", "measurement"},
     "decks": {"decks", "io", *CHAIN},
     "sweeps": {"sweeps", "io", "compilation", *CHAIN},
@@ -31,7 +32,7 @@ MAY_IMPORT |= {
 SEE_ALL = {"__init__", "__main__", "cli"}
 
 LIBRARY_HOMES = {
-    "xarray": {"results", "io", "decks", "sweeps", "plot", "cli"},
+    "xarray": {"results", "io", "decks", "sweeps", "plot", "report", "cli"},
     "h5py": {"io"},
     "scipy.io": {"io"},
     "tifffile": {"io"},
@@ -39,6 +40,7 @@ LIBRARY_HOMES = {
     "pyvista": {"io", "plot"},
     "vtk": {"io", "plot"},
     "matplotlib": {"plot"},
+    "plotly": {"report"},
     "pooch": {"datasets", "compilation"},
 }
 MAY_CONFIGURE_JAX = {"cli", "compilation"}  # in a function that the user calls

@@ -1,6 +1,5 @@
 """`opfem calibrate CURVE... --out DIR`: a material law from the stress–strain curves of a load frame."""
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,22 @@ from ..io import netcdf_bytes, read_stress_strain, write_together
 from ..solvers.progress import Progress
 from .curve_options import CurveOptions, LawOptions
 from .folder import prepare, refuse_links
-from .options import RunOptions
+from .options import PictureOptions, RunOptions
+from .output import pictures, with_drawings
 from .statement import configure_jax
 
 FILES = ("calibration.png", "summary.json", "result.nc")
 """What the command writes; the last marks a finished result."""
 
 
-def run_calibration(curves: list[str], out: Path, reading: CurveOptions, asked: LawOptions, run: RunOptions) -> None:
+def run_calibration(
+    curves: list[str],
+    out: Path,
+    reading: CurveOptions,
+    asked: LawOptions,
+    run: RunOptions,
+    files: PictureOptions = PictureOptions(),
+) -> None:
     """Fit a law to curves and write it.
 
     Args:
@@ -31,11 +38,12 @@ def run_calibration(curves: list[str], out: Path, reading: CurveOptions, asked: 
         reading: How to read the curves.
         asked: What to fit.
         run: The run itself.
+        files: Drawings to write, too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
         configure_jax(run.no_cache)
-        refuse_links(out, FILES)
+        refuse_links(out, with_drawings(FILES))
         if (out / FILES[-1]).exists() and not run.force:
             raise FileExistsError(
                 f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
@@ -61,16 +69,14 @@ def run_calibration(curves: list[str], out: Path, reading: CurveOptions, asked: 
         progress.stage("pictures")
         from ..plot import draw_calibration
 
-        picture = io.BytesIO()
-        draw_calibration(found).savefig(picture, dpi=150)
         numbers = {"curves": curves, **summary_of(found)}
         contents = {
-            "calibration.png": picture.getvalue(),
+            **pictures({FILES[0]: draw_calibration(found)}, files),
             "summary.json": (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode(),
             "result.nc": bytes(netcdf_bytes(_dataset(found))),
         }
-        write_together(out, contents, FILES)
-    _show(found, numbers, out)
+        write_together(out, contents, with_drawings(FILES))
+    _show(found, numbers, list(contents), out)
 
 
 def summary_of(found: Calibration) -> dict[str, Any]:
@@ -113,7 +119,7 @@ def _dataset(found: Calibration) -> xr.Dataset:
     )
 
 
-def _show(found: Calibration, numbers: dict[str, Any], out: Path) -> None:
+def _show(found: Calibration, numbers: dict[str, Any], files: list[str], out: Path) -> None:
     table = Table("number", "value", "std")
     for name in found.names:
         is_modulus = not name.startswith("alpha") and not (name.startswith("offset") and found.model.toe == "strain")
@@ -125,4 +131,4 @@ def _show(found: Calibration, numbers: dict[str, Any], out: Path) -> None:
     console.print(table)
     for said in numbers["advice"]:
         console.print(said, markup=False, soft_wrap=True)
-    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)
+    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)

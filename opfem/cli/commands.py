@@ -9,6 +9,7 @@ from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
+from .command_line import remember
 from .curve_options import CurveOptions, LawOptions
 from .deck_options import DeckOptions, WriteOptions
 from .messages import say
@@ -21,6 +22,8 @@ from .options import (
     LayerOptions,
     MapOptions,
     MicroscopeOptions,
+    PictureOptions,
+    ResultOptions,
     RunOptions,
     SolverOptions,
     StepOptions,
@@ -64,6 +67,7 @@ def run(tokens: Sequence[str] | None) -> None:
     Args:
         tokens: Arguments; None takes those of the process.
     """
+    remember(tokens)
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except CycloptsError as error:
@@ -82,16 +86,18 @@ def palpate(
     contact: ImprintOptions = ImprintOptions(),
     solver: SolverOptions = SolverOptions(),
     deck: WriteOptions = WriteOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Compute the stress map of a measured thickness map.
 
-    Writes result.nc, result.vtu, summary.json, pressure.png and report.png.
+    Writes result.nc, result.vtu, summary.json, report.html, the first thing to look at, pressure.png and report.png;
+    with --also files for other programs.
     """
     from .palpate import palpate
 
     with reporting(run.debug):
-        palpate(map, out, reading, layer, contact, solver, deck, run)
+        palpate(map, out, reading, layer, contact, solver, deck, run, files)
 
 
 @app.command
@@ -105,17 +111,18 @@ def fit(
     contact: ContactOptions = ContactOptions(),
     asked: FitOptions = FitOptions(),
     steps: StepOptions = StepOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit the traction on the sample to a measured thickness map, with its uncertainty.
 
     Needs the noise of the map, --std; the map itself is neither filled nor smoothed. Writes result.nc, result.vtu,
-    summary.json, pressure.png and fit.png.
+    summary.json, report.html, the first thing to look at, pressure.png and fit.png.
     """
     from .fit import fit
 
     with reporting(run.debug):
-        fit(map, out, reading, layer, contact, asked, steps, run)
+        fit(map, out, reading, layer, contact, asked, steps, run, files)
 
 
 @app.command
@@ -127,16 +134,17 @@ def sweep(
     *,
     out: _Out,
     resume: Annotated[bool, Parameter(help="Go on with the sweep that --out holds.")] = False,
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve for many values of materials, frictions and thickness, as CONFIG says.
 
-    Writes result.nc, labelled by the axes, and every finished point on the way.
+    Writes result.nc, labelled by the axes, its numbers as table.csv and sweep.png, and every finished point on the way.
     """
     from .sweep import sweep
 
     with reporting(run.debug):
-        sweep(config, out, resume, run)
+        sweep(config, out, resume, run, files)
 
 
 @app.command
@@ -153,17 +161,18 @@ def simulate(
     *,
     out: _Out,
     deck: WriteOptions = WriteOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve a virtual experiment, whose true stress is known: layer and deformable sample between window and plate.
 
     Writes map.npz, which palpate and fit take with its noise, result.nc and result.vtu (the truth), summary.json,
-    section.png and report.png; l0.npz where the layer's thickness is a map.
+    report.html, section.png and report.png; l0.npz where the layer's thickness is a map.
     """
     from .simulate import simulate
 
     with reporting(run.debug):
-        simulate(scene, out, deck, run)
+        simulate(scene, out, deck, run, files)
 
 
 @app.command
@@ -176,11 +185,13 @@ def deck(
         bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
     ] = False,
     asked: DeckOptions = DeckOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Solve an Abaqus or CalculiX deck: a soft layer between rigid bodies, or under a soft sample; step by step.
 
-    Writes result.nc, result.vtu, summary.json and pictures of the last step, those of earlier ones in step_1 and so on.
+    Writes result.nc, result.vtu, summary.json, report.html and pictures of the last step, those of earlier ones in
+    step_1 and so on.
     From the second step on, result.nc holds axial_increment, what a phase-sensitive OCT sees between two steps.
     """
     from .deck import solve_deck, state_deck
@@ -191,7 +202,7 @@ def deck(
         elif out is None:
             raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
         else:
-            solve_deck(file, out, asked, run)
+            solve_deck(file, out, asked, run, files)
 
 
 @app.command
@@ -213,6 +224,7 @@ def oct(
     reading: VolumeOptions = VolumeOptions(),
     microscope: MicroscopeOptions = MicroscopeOptions(),
     asked: InterfaceOptions = InterfaceOptions(),
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Measure the thickness of the layer in an OCT volume, or the displacement between two.
@@ -228,9 +240,9 @@ def oct(
         if (loaded is None) == (phase is None):
             raise ValueError("opfem oct takes either LOADED or --phase BEFORE AFTER.")
         if phase is not None:
-            return measure_phase(phase, out, reading, microscope, run)
+            return measure_phase(phase, out, reading, microscope, run, files)
         assert loaded is not None
-        measure(loaded, out, unloaded, l0, reading, microscope, asked, run)
+        measure(loaded, out, unloaded, l0, reading, microscope, asked, run, files)
 
 
 @app.command
@@ -241,6 +253,7 @@ def calibrate(
     out: _Out,
     reading: CurveOptions = CurveOptions(),
     asked: LawOptions = LawOptions(),
+    files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Fit a material law to stress–strain curves, and say what they can and cannot tell.
@@ -250,7 +263,7 @@ def calibrate(
     from .calibrate import run_calibration
 
     with reporting(run.debug):
-        run_calibration(list(curves), out, reading, asked, run)
+        run_calibration(list(curves), out, reading, asked, run, files)
 
 
 @app.command
@@ -259,10 +272,11 @@ def demo(
     out: _Out = Path("opfem_demo"),
     coin: Annotated[bool, Parameter(help="Take the published map of a 5-cent coin (downloaded once, GPL-3).")] = False,
     solver: SolverOptions = SolverOptions(),
+    files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
     """Show what opfem does: the stress map of a built-in measurement, or of the published coin."""
     from .palpate import demo
 
     with reporting(run.debug):
-        demo(out, coin, solver, run)
+        demo(out, coin, solver, run, files)

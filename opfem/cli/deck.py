@@ -20,7 +20,9 @@ from ..solvers import ConvergenceError, ExperimentSolution, Explicit, Newton, So
 from ..solvers.progress import Progress
 from .deck_options import DeckOptions
 from .folder import DECK_PICTURE, prepare, record_failure, settle, write_result
-from .options import RunOptions
+from .options import ResultOptions, RunOptions
+from .output import show_warnings
+from .record import with_record
 from .statement import configure_jax
 
 INCREMENT = "axial_increment"
@@ -128,7 +130,9 @@ def _picture(deck: Deck, bodies: list[Body], loads: tuple[Any, ...]) -> bytes:
     return picture.getvalue()
 
 
-def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> None:
+def solve_deck(
+    file: Path, out: Path, asked: DeckOptions, run: RunOptions, files: ResultOptions = ResultOptions()
+) -> None:
     """Solve all steps of a deck and write them, the last one last.
 
     Args:
@@ -136,6 +140,7 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
         out: Folder of the results.
         asked: How it is taken.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -162,13 +167,13 @@ def solve_deck(file: Path, out: Path, asked: DeckOptions, run: RunOptions) -> No
             record_failure({**summary(failure.solution), "step": step.name, "deck": record, "steps": steps}, out)
             raise ConvergenceError(f"Step {step.name}: {failure}", failure.solution) from None
         numbers = summary(solution)
-        files = _write(solution, before, {**numbers, "step": step.name, "deck": record, "steps": steps}, folder, run)
+        said = {**numbers, "step": step.name, "deck": record, "steps": steps}
+        written = _write(solution, before, said, folder, run, files)
         steps = [*steps, {"step": step.name, **numbers}]
         before = solution
         console.print(_results(step.name, numbers))
-        if numbers["status_message"]:
-            console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
-        console.print(f"Wrote {', '.join(files)} to {folder}", markup=False, soft_wrap=True)
+        show_warnings(numbers)
+        console.print(f"Wrote {', '.join(written)} to {folder}", markup=False, soft_wrap=True)
 
 
 def _solver(deck: Deck, asked: DeckOptions) -> Newton | Explicit:
@@ -194,6 +199,7 @@ def _write(
     numbers: dict[str, Any],
     folder: Path,
     run: RunOptions,
+    files: ResultOptions,
 ) -> list[str]:
     """Write every file of a step; return their names."""
     settle(folder, run.force)
@@ -202,7 +208,10 @@ def _write(
         progress.stage("pictures")
         from ..plot import draw_pictures, draw_simulation
 
-        dataset = to_xarray(solution)
+        said = numbers["deck"]["assumed"]
+        # The sentences name materials, not bodies: of two with one open, both are marked.
+        bulk = [f"{body}.material.bulk" for body in ("layer", "sample") if any("D = 0" in part for part in said)]
+        dataset = with_record(to_xarray(solution), bulk, said, numbers["warnings"])
         if before is not None:
             dataset[INCREMENT] = axial_increment(solution, before)
         if isinstance(solution, Solution):
@@ -213,7 +222,7 @@ def _write(
             spacing = np.asarray(solution.experiment.extent) / solution.experiment.layer_elements[:2]
             figures = draw_simulation(dataset, measured_thickness(solution, spacing))
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, folder)
+        return write_result(dataset, figures, numbers, folder, asked=files)  # nothing of a deck is measured
 
 
 def axial_increment(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution) -> xr.DataArray:

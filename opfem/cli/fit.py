@@ -12,11 +12,13 @@ from rich.table import Table
 from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
 from ..model import Contact, MooneyRivlin, Palpation
-from ..results import summary, to_xarray
+from ..results import area_rows, pressure_rows, summary, to_xarray
 from ..solvers import Newton
 from ..solvers.progress import Progress
 from .folder import EXAMPLE, prepare, settle, write_result
-from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, RunOptions, StepOptions
+from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, ResultOptions, RunOptions, StepOptions
+from .output import show_warnings
+from .record import assumed_options, with_record
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
 _ELEMENTS_PER_LENGTH = 3.0
@@ -31,6 +33,7 @@ def fit(
     asked: FitOptions,
     steps: StepOptions,
     run: RunOptions,
+    files: ResultOptions = ResultOptions(),
 ) -> None:
     """Fit the traction on the sample to a measured thickness map and write it.
 
@@ -43,6 +46,7 @@ def fit(
         asked: The fit.
         steps: How the load is applied.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -74,16 +78,18 @@ def fit(
                 draws=asked.draws,
             )
         progress.stage("pictures")
-        numbers = fit_summary(fitted)
+        numbers = fit_summary(fitted, measured)
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_fit
 
-        dataset = to_xarray(fitted)
+        said = [*numbers["warnings"], *filter(None, [numbers["advice"]])]
+        dataset = with_record(to_xarray(fitted), assumed_options(), warnings=said)
         figures = draw_fit(dataset, measured)
         progress.stage("writing")
         example = {EXAMPLE: measured} if map == "example" else {}
-        files = write_result(dataset, figures, {**numbers, "settings": settings}, out, example)
-    _show(numbers, files, out)
+        numbers["settings"] = settings
+        written = write_result(dataset, figures, numbers, out, example, measured=measured, asked=files)
+    _show(numbers, written, out)
 
 
 def state_prior(palpation: Palpation, filled: ThicknessMap, asked: FitOptions) -> Matern:
@@ -103,16 +109,17 @@ def state_prior(palpation: Palpation, filled: ThicknessMap, asked: FitOptions) -
     )
 
 
-def fit_summary(fitted: TractionFit) -> dict[str, Any]:
+def fit_summary(fitted: TractionFit, measured: ThicknessMap) -> dict[str, Any]:
     """Summarise a fit in types that JSON knows, every key with its unit.
 
     Args:
         fitted: A fit of one map, with the prior of `state_prior`.
+        measured: The map.
     """
     stats, prior = fitted.stats, fitted.prior
     assert isinstance(prior, Matern)
     return {
-        **summary(fitted.solution),
+        **summary(fitted.solution, measured),
         "pressure_std_mean_kPa": 1e3 * float(fitted.pressure_std.mean()),
         "pressure_std_max_kPa": 1e3 * float(fitted.pressure_std.max()),
         "pressure_std_error_percent": 100.0 * float(stats["std_error"]),
@@ -120,7 +127,7 @@ def fit_summary(fitted: TractionFit) -> dict[str, Any]:
         "advice": fitted.advice(),
         "effective_dof": float(fitted.effective_dof),
         "observed_dof": float(fitted.observed),
-        "residual_rms_um": 1e3 * float(stats["misfit_rms"]),
+        "misfit_rms_um": 1e3 * float(stats["misfit_rms"]),
         "model_std_um": 1e3 * float(stats["model_std"]),
         "representation_rms_um": 1e3 * float(stats["representation_rms"]),
         "resolution_um": [1e3 * float(width) for width in fitted.resolution_width],
@@ -157,10 +164,11 @@ def _asked(asked: FitOptions, prior: Matern) -> dict[str, Any]:
 def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
     rows = [
         ("force on the layer, normal", f"{-numbers['force_sample_N'][2]:.4g}", "N"),
-        ("mean pressure", f"{numbers['pressure_mean_kPa']:.3g}", "kPa"),
-        ("largest pressure", f"{numbers['pressure_max_kPa']:.3g}", "kPa"),
+        *pressure_rows(numbers),
         ("its standard deviation, mean", f"{numbers['pressure_std_mean_kPa']:.2g}", "kPa"),
         ("resolution", f"{sorted(numbers['resolution_um'])[len(numbers['resolution_um']) // 2]:.0f}", "µm"),
+        *area_rows(numbers),
+        ("measured − computed thickness, rms", f"{numbers['residual_rms_um']:.2g}", "µm"),
         ("thickness that the mesh misses", f"{numbers['model_std_um']:.2g}", "µm"),
         ("χ² per degree of freedom", f"{numbers['reduced_chi2']:.2f}", ""),
         (
@@ -181,6 +189,7 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
         table.add_row(*row)
     console = Console(highlight=False)
     console.print(table)
+    show_warnings(numbers)
     if numbers["advice"]:
         console.print(numbers["advice"], style="yellow")
     for name, part in numbers["not_identified_within_25_percent"].items():

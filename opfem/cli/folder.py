@@ -3,7 +3,6 @@
 A link is followed where it is the folder, and refused where it is a file of a result.
 """
 
-import io
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -13,18 +12,24 @@ from typing import Any
 
 import xarray as xr
 
-from ..io import finish, netcdf_bytes, vtu_bytes, whole_file, write_thickness, write_together
+from ..io import MAP_FILES, finish, netcdf_bytes, vtu_bytes, whole_file, write_thickness, write_together
 from ..measurement import ThicknessMap
 from ..sweeps.store import PLAN
+from .options import ResultOptions
+from .output import REPORT, exports, pictures, with_drawings
 
 # The mark of a finished result comes last: a folder that holds it holds a whole result.
 FINISHED = "result.nc"
 EXAMPLE = "example_map.npz"
 SIMULATED, UNLOADED = "map.npz", "l0.npz"
 DECK_PICTURE = "deck.png"
-_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png", DECK_PICTURE)
+_PICTURES = ("pressure.png", "report.png", "fit.png", "section.png")
+_EXPORTS = (REPORT, *(f"result{suffix}" for suffix, _ in MAP_FILES.values()))
 # All that `palpate`, `fit` and `simulate` write.
-RESULT = (EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_PICTURES, "summary.json", FINISHED)
+RESULT = (
+    *(EXAMPLE, SIMULATED, UNLOADED, "result.vtu", *_EXPORTS),
+    *(*with_drawings(_PICTURES), DECK_PICTURE, "summary.json", FINISHED),
+)
 
 
 def settle(out: Path, force: bool) -> None:
@@ -73,6 +78,9 @@ def write_result(
     numbers: dict[str, Any],
     out: Path,
     maps: Mapping[str, ThicknessMap] = MappingProxyType({}),
+    *,
+    measured: ThicknessMap | None = None,
+    asked: ResultOptions = ResultOptions(),
 ) -> list[str]:
     """Write every file of a result: all are complete before one of an old result is replaced.
 
@@ -82,16 +90,15 @@ def write_result(
         numbers: For summary.json.
         out: Folder of the results.
         maps: Thickness maps by file name: the built-in one where that was measured, or those that were simulated.
+        measured: Measured map, whose pixels exported maps have; None takes those of the load.
+        asked: Which files for other programs are written, too.
 
     Returns:
         The names of the files.
     """
     contents: dict[str, Any] = {name: _thickness_bytes(thickness) for name, thickness in maps.items()}
     contents["result.vtu"] = vtu_bytes(dataset)
-    for name, figure in figures.items():
-        picture = io.BytesIO()
-        figure.savefig(picture, dpi=200)
-        contents[name] = picture.getvalue()
+    contents |= exports(dataset, measured, asked) | pictures(figures, asked)
     contents["summary.json"] = _json(numbers)
     contents[FINISHED] = netcdf_bytes(dataset)
     write_together(out, contents, RESULT)

@@ -98,7 +98,8 @@ def say(error: "CycloptsError") -> str:
             return f"{name} {error.exception_message}"
         case CoercionError() if error.argument is not None:
             got = " ".join(token.value for token in error.argument.tokens) or getattr(error.token, "value", "nothing")
-            return f"{name} {_wanted(error.argument)}, got {got!r}.{_meant(error)}"
+            keyword = getattr(error.token, "keyword", None) or name  # a flag goes by two names
+            return f"{keyword} {_wanted(error.argument)}, got {got!r}.{_meant(error)}"
         case MissingArgumentError() if error.argument is not None:
             return _missing(error)
         case RepeatArgumentError():
@@ -155,6 +156,6 @@ def validators(stated: Any) -> tuple[Any, ...]:
 
 
 def _choices(hint: Any) -> list[str]:
-    if get_origin(hint) in (Union, types.UnionType):
+    if get_origin(hint) in (Union, types.UnionType, tuple):
         return [choice for part in get_args(hint) for choice in _choices(part)]
     return [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []

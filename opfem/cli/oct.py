@@ -20,7 +20,8 @@ from ..measurement import MeasurementError, ThicknessMap
 from ..measurement.oct import EDGES, Interface, OctSystem, OctVolume, find_interface
 from ..solvers.progress import Progress
 from .folder import prepare, refuse_links
-from .options import InterfaceOptions, MicroscopeOptions, RunOptions, VolumeOptions
+from .options import InterfaceOptions, MicroscopeOptions, PictureOptions, RunOptions, VolumeOptions
+from .output import pictures, with_drawings
 from .statement import configure_jax
 
 FILES = ("interface.npz", "unloaded.npz", "bscans.png", "maps.png", "summary.json", "thickness.npz")
@@ -38,6 +39,7 @@ def measure(
     microscope: MicroscopeOptions,
     asked: InterfaceOptions,
     run: RunOptions,
+    files: PictureOptions = PictureOptions(),
 ) -> None:
     """Measure the thickness of the layer and write it.
 
@@ -50,13 +52,14 @@ def measure(
         microscope: The microscope.
         asked: What to look for.
         run: The run itself.
+        files: Drawings to write, too.
     """
     if unloaded is not None and l0 is not None:
         raise ValueError("--l0 and --unloaded both state the unloaded layer; leave one out.")
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
         configure_jax(run.no_cache)
-        refuse_links(out, FILES)
+        refuse_links(out, with_drawings(FILES))
         if (out / FILES[-1]).exists() and not run.force:
             raise FileExistsError(
                 f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
@@ -78,13 +81,10 @@ def measure(
         contents = {"interface.npz": _interface_bytes(interface)}
         if first is not None:
             contents["unloaded.npz"] = _map_bytes(first)
-        for name, figure in draw_interface(volume, interface, thickness).items():
-            picture = io.BytesIO()
-            figure.savefig(picture, dpi=150)
-            contents[name] = picture.getvalue()
+        contents |= pictures(draw_interface(volume, interface, thickness), files)
         contents["summary.json"] = (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode()
         contents["thickness.npz"] = _map_bytes(thickness)
-        write_together(out, contents, FILES)
+        write_together(out, contents, with_drawings(FILES))
     _show(numbers, list(contents), out)
 
 

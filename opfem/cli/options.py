@@ -361,7 +361,33 @@ class SolverOptions:
     ] = None
 
 
-@Parameter(name="*", group=Group("Run", sort_key=6))
+@Parameter(name="*", group=Group("Files", sort_key=6))
+@dataclass(frozen=True)
+class PictureOptions:
+    """Pictures as drawings, for print."""
+
+    pdf: Annotated[bool, Parameter(help="Write every picture as .pdf, too.")] = False
+    svg: Annotated[bool, Parameter(help="Write every picture as .svg, too.")] = False
+
+
+@Parameter(name="*", group=Group("Files", sort_key=6))
+@dataclass(frozen=True)
+class ResultOptions(PictureOptions):
+    """Files of a result, for browsers and for other programs."""
+
+    also: Annotated[
+        tuple[Literal["csv", "tiff", "mat"], ...],
+        Parameter(
+            help="Write the maps, too, on the pixels of the measured one: result.csv, result.tif (ImageJ), result.mat.",
+            consume_multiple=True,
+        ),
+    ] = ()
+    report: Annotated[
+        bool, Parameter(help="Write report.html, 5 to 8 MB, which any browser opens.", negative="--no-report")
+    ] = True
+
+
+@Parameter(name="*", group=Group("Run", sort_key=7))
 @dataclass(frozen=True)
 class RunOptions:
     """The run itself."""

@@ -16,7 +16,9 @@ from ..solvers.progress import Progress
 from .deck_options import WriteOptions
 from .export import export, linear_settings, with_linear_contact
 from .folder import EXAMPLE, FINISHED, prepare, record_failure, settle, write_result
-from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions, SolverOptions
+from .options import ImprintOptions, LayerOptions, MapOptions, ResultOptions, RunOptions, SolverOptions
+from .output import show_warnings
+from .record import assumed_options, with_record
 from .statement import configure_jax, read_maps, settings_of, show_assumptions, state_experiment
 
 
@@ -29,6 +31,7 @@ def palpate(
     solver: SolverOptions,
     deck: WriteOptions,
     run: RunOptions,
+    files: ResultOptions = ResultOptions(),
 ) -> None:
     """Solve for the stress map of a measured thickness map and write it.
 
@@ -41,6 +44,7 @@ def palpate(
         solver: The solver.
         deck: A deck of the problem, to write too.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -61,11 +65,13 @@ def palpate(
             record_failure({**summary(failure.solution), "settings": settings}, out)
             kept = f" {out} keeps its finished result." if (out / FINISHED).exists() else ""
             raise ConvergenceError(f"{failure}{kept}", failure.solution) from None
-        files = write_results(solution, measured, settings, out, is_example=map == "example")
-    _show_results(solution, files, out)
+        progress.stage("summary")
+        numbers = {**summary(solution, measured), "settings": settings}
+        written = write_results(solution, measured, numbers, out, files, is_example=map == "example")
+    _show_results(numbers, written, out)
 
 
-def demo(out: Path, coin: bool, solver: SolverOptions, run: RunOptions) -> None:
+def demo(out: Path, coin: bool, solver: SolverOptions, run: RunOptions, files: ResultOptions = ResultOptions()) -> None:
     """Compute the stress map of a built-in measurement, or of the published coin.
 
     Args:
@@ -73,22 +79,30 @@ def demo(out: Path, coin: bool, solver: SolverOptions, run: RunOptions) -> None:
         coin: Which measurement.
         solver: The solver.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     map = str(coin_file()) if coin else "example"
     reading = MapOptions(l0=str(COIN_LAYER), extent=(5.0, 5.0)) if coin else MapOptions()
-    palpate(map, out, reading, LayerOptions(), ImprintOptions(), solver, WriteOptions(), run)
+    palpate(map, out, reading, LayerOptions(), ImprintOptions(), solver, WriteOptions(), run, files)
 
 
 def write_results(
-    solution: Solution, measured: ThicknessMap, settings: dict[str, Any], out: Path, *, is_example: bool
+    solution: Solution,
+    measured: ThicknessMap,
+    numbers: dict[str, Any],
+    out: Path,
+    files: ResultOptions,
+    *,
+    is_example: bool,
 ) -> list[str]:
     """Write every file of a result; return their names.
 
     Args:
         solution: What was solved.
         measured: Loaded thickness as measured, for the report.
-        settings: What the user asked for, for summary.json.
+        numbers: For summary.json.
         out: Folder of the results.
+        files: Files for other programs, to write too.
         is_example: Whether the built-in map was measured, which is written, too.
     """
     with Progress(True, at_once=True) as progress:
@@ -96,11 +110,11 @@ def write_results(
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_pictures
 
-        dataset = to_xarray(solution)
-        numbers = {**summary(solution), "settings": settings}
+        dataset = with_record(to_xarray(solution), assumed_options(), warnings=numbers["warnings"])
         figures = draw_pictures(dataset, measured)
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, out, {EXAMPLE: measured} if is_example else {})
+        maps = {EXAMPLE: measured} if is_example else {}
+        return write_result(dataset, figures, numbers, out, maps, measured=measured, asked=files)
 
 
 def _solver(options: SolverOptions) -> Newton | Explicit:
@@ -127,14 +141,12 @@ def _solver(options: SolverOptions) -> Newton | Explicit:
     )
 
 
-def _show_results(solution: Solution, files: list[str], out: Path) -> None:
-    numbers = summary(solution)
+def _show_results(numbers: dict[str, Any], files: list[str], out: Path) -> None:
     table = Table("at the sample", "", "")
     table.columns[1].justify = "right"
     for row in summary_rows(numbers):
         table.add_row(*row)
     console = Console(highlight=False)
     console.print(table)
-    if numbers["status_message"]:
-        console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
+    show_warnings(numbers)
     console.print(f"Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)

@@ -14,7 +14,8 @@ from ..measurement.oct import DisplacementVolume, OctSystem, axial_displacement
 from ..solvers.progress import Progress
 from .folder import prepare, refuse_links
 from .oct import read_volume
-from .options import MicroscopeOptions, RunOptions, VolumeOptions
+from .options import MicroscopeOptions, PictureOptions, RunOptions, VolumeOptions
+from .output import pictures, with_drawings
 from .statement import configure_jax
 
 FILES = ("displacement.png", "summary.json", "displacement.npz")
@@ -22,7 +23,12 @@ FILES = ("displacement.png", "summary.json", "displacement.npz")
 
 
 def measure_phase(
-    paths: tuple[str, str], out: Path, reading: VolumeOptions, microscope: MicroscopeOptions, run: RunOptions
+    paths: tuple[str, str],
+    out: Path,
+    reading: VolumeOptions,
+    microscope: MicroscopeOptions,
+    run: RunOptions,
+    files: PictureOptions = PictureOptions(),
 ) -> None:
     """Measure the displacement and write it.
 
@@ -32,11 +38,12 @@ def measure_phase(
         reading: How to read the volumes.
         microscope: The microscope.
         run: The run itself.
+        files: Drawings to write, too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
         configure_jax(run.no_cache)
-        refuse_links(out, FILES)
+        refuse_links(out, with_drawings(FILES))
         if (out / FILES[-1]).exists() and not run.force:
             raise FileExistsError(
                 f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
@@ -48,15 +55,13 @@ def measure_phase(
         progress.stage("pictures")
         from ..plot import draw_displacement
 
-        picture = io.BytesIO()
-        draw_displacement(found).savefig(picture, dpi=150)
         numbers = {"before": paths[0], "after": paths[1], **_numbers(found)}
         contents = {
-            "displacement.png": picture.getvalue(),
+            **pictures({FILES[0]: draw_displacement(found)}, files),
             "summary.json": (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode(),
             "displacement.npz": _bytes(found),
         }
-        write_together(out, contents, FILES)
+        write_together(out, contents, with_drawings(FILES))
     console = Console(highlight=False)
     console.print(
         f"displacement {numbers['displacement_min_nm']:.0f} to {numbers['displacement_max_nm']:.0f} nm, standard "
@@ -65,7 +70,7 @@ def measure_phase(
         markup=False,
         soft_wrap=True,
     )
-    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(FILES)} to {out}", markup=False, soft_wrap=True)
+    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(contents)} to {out}", markup=False, soft_wrap=True)
 
 
 def _numbers(found: DisplacementVolume) -> dict[str, Any]:

@@ -17,12 +17,16 @@ from ..solvers.progress import Progress
 from .deck_options import WriteOptions
 from .export import export, with_linear_contact
 from .folder import FINISHED, SIMULATED, UNLOADED, prepare, record_failure, settle, write_result
-from .options import RunOptions
+from .options import ResultOptions, RunOptions
+from .output import show_warnings
+from .record import assumed_keys, with_record
 from .scene import Scene, in_keys, read_scene
 from .statement import configure_jax
 
 
-def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> None:
+def simulate(
+    config: Path, out: Path, deck: WriteOptions, run: RunOptions, files: ResultOptions = ResultOptions()
+) -> None:
     """Solve the experiment of a scene, measure it, and write map, truth and pictures.
 
     Args:
@@ -30,6 +34,7 @@ def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> No
         out: Folder of the results.
         deck: A deck of the problem, to write too.
         run: The run itself.
+        files: Files for other programs, to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -56,14 +61,15 @@ def simulate(config: Path, out: Path, deck: WriteOptions, run: RunOptions) -> No
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_simulation
 
-        dataset = to_xarray(truth)
+        numbers = {**summary(truth), "scene": scene.stated}
+        dataset = with_record(to_xarray(truth), assumed_keys(scene.stated), warnings=numbers["warnings"])
         figures = draw_simulation(dataset, measured, scene.section)
         maps = {SIMULATED: measured}
         if isinstance(scene.experiment.layer.thickness, ThicknessMap):
             maps[UNLOADED] = _unloaded(truth, measured)
         progress.stage("writing")
-        files = write_result(dataset, figures, {**summary(truth), "scene": scene.stated}, out, maps)
-    _show_results(truth, files, out)
+        written = write_result(dataset, figures, numbers, out, maps, measured=measured, asked=files)
+    _show_results(truth, numbers, written, out)
 
 
 def _unloaded(truth: ExperimentSolution, measured: ThicknessMap) -> ThicknessMap:
@@ -91,16 +97,14 @@ def _show_experiment(scene: Scene) -> None:
     Console(highlight=False).print("Solving the virtual experiment:", table, sep="\n")
 
 
-def _show_results(truth: ExperimentSolution, files: list[str], out: Path) -> None:
-    numbers: dict[str, Any] = summary(truth)
+def _show_results(truth: ExperimentSolution, numbers: dict[str, Any], files: list[str], out: Path) -> None:
     table = Table("at the interface", "", "")
     table.columns[1].justify = "right"
     for row in summary_rows(numbers):
         table.add_row(*row)
     console = Console(highlight=False)
     console.print(table)
-    if numbers["status_message"]:
-        console.print(f"{numbers['status']}: {numbers['status_message']}", style="yellow", markup=False)
+    show_warnings(numbers)
     console.print(f"Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)
     console.print(
         f"Now: opfem palpate {out / SIMULATED} {_options(truth.experiment, out)}", markup=False, soft_wrap=True

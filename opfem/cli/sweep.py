@@ -16,24 +16,27 @@ from rich.console import Console
 from scipy.stats import qmc
 
 from ..datasets import coin_file
-from ..io import finish, take_place
+from ..io import finish, take_place, write_whole
 from ..model import Imprint, Palpation
 from ..results.dataset import STATS
 from ..solvers import Newton, Solution, solve
 from ..solvers.discretise import check_compatible
 from ..solvers.progress import Progress
 from ..sweeps import Batch, sample, sweep as compute, zip_
+from ..sweeps.columns import SweepColumns, columns
 from ..sweeps.design import Points, grid, known_name
-from ..sweeps.outputs import FIELDS, GOOD
-from ..sweeps.store import FINISHED, PLAN, POINTS
+from ..sweeps.outputs import FIELDS
+from ..sweeps.store import FINISHED, PLAN, POINTS, TABLE
 from .folder import prepare, refuse_links
 from .messages import in_options, validators
-from .options import ImprintOptions, LayerOptions, MapOptions, RunOptions
+from .options import ImprintOptions, LayerOptions, MapOptions, PictureOptions, RunOptions
+from .output import pictures, with_drawings
 from .statement import configure_jax, read_maps, state_experiment, state_palpation
 from .toml_file import converted, read_toml
 
+PICTURE = "sweep.png"
 # All that a sweep writes, the mark of a finished one last.
-RESULT = (POINTS, PLAN, FINISHED)
+RESULT = (POINTS, PLAN, TABLE, *with_drawings((PICTURE,)), FINISHED)
 # Where a sweep is computed that is to take the place of the one in the folder around it.
 _REPLACEMENT = ".opfem-replacement"
 
@@ -75,6 +78,8 @@ _UNITS = {
 _Options = TypeVar("_Options")
 _SECTIONS = ("inputs", "axes", "design", "outputs", "execution")
 _MOST_STATED = 200  # points that are checked one by one, a millisecond each
+_MOST_FAILED = 5  # points that are named
+_READ_IN = {"MPa": (1e3, "kPa"), "mm": (1e3, "µm")}
 _DESIGNS = ("grid", "zip", "sobol", "latin_hypercube")
 
 
@@ -88,7 +93,7 @@ class _Inputs(NamedTuple):
     increments: int | None
 
 
-def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
+def sweep(config: Path, out: Path, resume: bool, run: RunOptions, files: PictureOptions = PictureOptions()) -> None:
     """Solve at all points that a file states, and write the table.
 
     Everything in the file is checked before the folder is touched or a program compiled.
@@ -98,6 +103,7 @@ def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
         out: Folder of the results.
         resume: Whether to go on with what the folder holds.
         run: The run itself.
+        files: Drawings to write too.
     """
     with Progress(True, at_once=True) as progress:
         progress.stage("reading")
@@ -109,12 +115,45 @@ def sweep(config: Path, out: Path, resume: bool, run: RunOptions) -> None:
         function = _function(_inputs(stated["inputs"], points, config.parent), points)
         folder = _settle(out, resume, run.force)
         prepare(out)
-        data = compute(function, points, keep=keep, execution=execution, out=folder)
+        found = columns(compute(function, points, keep=keep, execution=execution, out=folder)).read_in(_READ_IN)
+        progress.stage("pictures")
+        for name, content in _pictures(found, files).items():
+            write_whole(folder / name, content)
         if folder != out:
             take_place(out, folder, RESULT)
-    failed = int(np.sum(~np.isin(data.status, GOOD)))
+    _show(found, out)
+
+
+def _pictures(found: SweepColumns, files: PictureOptions) -> dict[str, bytes]:
+    """Draw what was kept as one number a point, by file name; nothing where that is nothing."""
+    if not (found.outputs and found.axes and found.good.any()):
+        return {}
+    # Loaded here, so that a refused run does not wait for matplotlib.
+    from ..plot import draw_sweep
+
+    axes, outputs = (
+        {found.title(name): values for name, values in numbers.items()} for numbers in (found.axes, found.outputs)
+    )
+    return pictures({PICTURE: draw_sweep(axes, outputs, found.good, found.shape)}, files)
+
+
+def _show(found: SweepColumns, out: Path) -> None:
+    """Print the points of the lowest and highest outputs, those that failed, and what was written."""
+    failed = np.flatnonzero(~found.good)
+    lines = []
+    for name, values in found.outputs.items():
+        if (ends := found.ends(name)) is not None:
+            low, high = (f"{found.written(name, values[point])} at {found.at(point)}" for point in ends)
+            lines.append(f"{name}: lowest {low}; highest {high}")
+    lines += [
+        f"Failed at {found.at(point)}: {found.status[point]} {found.message[point]}".rstrip()
+        for point in failed[:_MOST_FAILED]
+    ]
+    written = [name for name in RESULT[2:] if (out / name).exists()]
+    lines.append(f"{found.status.size} points, {failed.size} failed. Wrote {', '.join(written)} to {out}")
     console = Console(highlight=False)
-    console.print(f"{len(points)} points, {failed} failed. Wrote {FINISHED} to {out}", markup=False, soft_wrap=True)
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def _read(config: Path) -> dict[str, Any]:

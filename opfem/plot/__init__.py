@@ -4,11 +4,8 @@ from .calibration import draw_calibration, plot_calibration
 from .deck import draw_deck
 from .experiment import draw_simulation, plot_comparison, plot_section
 from .maps import (
-    draw_fit,
-    draw_pictures,
-    plot_fit,
+    plot_compression,
     plot_pressure,
-    plot_report,
     plot_residual,
     plot_status,
     plot_thickness,
@@ -16,7 +13,9 @@ from .maps import (
 )
 from .oct import draw_interface, plot_interface
 from .phase import draw_displacement, plot_displacement
+from .reports import draw_fit, draw_pictures, plot_fit, plot_report
 from .scene import plot_layer
+from .sweep import draw_sweep
 
 __all__ = [
     "draw_calibration",
@@ -26,8 +25,10 @@ __all__ = [
     "draw_interface",
     "draw_pictures",
     "draw_simulation",
+    "draw_sweep",
     "plot_calibration",
     "plot_comparison",
+    "plot_compression",
     "plot_displacement",
     "plot_fit",
     "plot_interface",

@@ -1,16 +1,20 @@
 """A picture of what a deck states: its bodies from the side, and what each step presses in."""
 
 from collections.abc import Mapping
+from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from ..measurement import ThicknessMap
-from .maps import draw_image
+from . import layout
+from .calibration import COLOURS
 
-_SIDE_HEIGHT, _MAP_HEIGHT, _WIDTH = 2.6, 3.0, 8.0  # inch
+_SIDE_HEIGHT, _SIDE_WIDTH = 2.6, 8.0  # inch
 _MOST_MAPS = 4
 _UM = 1e3
 
@@ -26,19 +30,31 @@ def draw_deck(
         title: Above it.
     """
     shown = dict(list(maps.items())[:_MOST_MAPS])
-    height = _SIDE_HEIGHT + (_MAP_HEIGHT if shown else 0.0)
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-    ratios = [_SIDE_HEIGHT, _MAP_HEIGHT] if shown else [_SIDE_HEIGHT]
-    grid = figure.add_gridspec(len(ratios), max(len(shown), 1), height_ratios=ratios)
-    side = figure.add_subplot(grid[0, :])
+    grids = [(np.asarray(thickness.x), np.asarray(thickness.y)) for thickness in shown.values()]
+    limits = layout.together(*(layout.pixel_limits(*grid) for grid in grids)) if grids else None
+    width, height = (0.0, 0.0) if limits is None else layout.page(len(grids), limits)[1]
+    figure = Figure(figsize=(max(width, _SIDE_WIDTH), _SIDE_HEIGHT + height), layout="constrained")
+    if limits is None:
+        _draw_side(sections, title, figure.subplots())
+        return figure
+    parts: Any = figure.subfigures(2, 1, height_ratios=[_SIDE_HEIGHT, height])
+    above, below = parts
+    _draw_side(sections, title, above.subplots())
+    panels = {f"Surface of {name}": partial(_draw_surface, thickness) for name, thickness in shown.items()}
+    layout.draw_page(panels, limits, below)
+    return figure
+
+
+def _draw_side(sections: Mapping[str, np.ndarray], title: str, side: Axes) -> None:
     for number, (name, corners) in enumerate(sections.items()):
-        side.add_collection(PolyCollection(list(corners), facecolor=f"C{number}", edgecolor="k", lw=0.2, label=name))
+        side.add_collection(
+            PolyCollection(list(corners), facecolor=COLOURS[number % len(COLOURS)], edgecolor="k", lw=0.2, label=name)
+        )
     side.autoscale_view()
     side.set(xlabel="x [mm]", ylabel="z [mm]", title=title)
     side.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)
-    for column, (name, thickness) in enumerate(shown.items()):
-        ax = figure.add_subplot(grid[1, column])
-        values = np.where(thickness.mask, np.nan, thickness.values)
-        draw_image(_UM * values, np.asarray(thickness.x), np.asarray(thickness.y), ax, "[µm]", "viridis", None)
-        ax.set_title(f"Surface of {name}", fontsize="medium")
-    return figure
+
+
+def _draw_surface(thickness: ThicknessMap, ax: Axes) -> None:
+    values = np.where(thickness.mask, np.nan, thickness.values)
+    layout.image(_UM * values, np.asarray(thickness.x), np.asarray(thickness.y), ax, "Height [µm]", "viridis")

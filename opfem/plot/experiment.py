@@ -3,6 +3,8 @@
 Edge of the chain: drawn from `to_xarray` and `compare`. Sections have the window at the top, as a B-scan has.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,13 +16,13 @@ from matplotlib.figure import Figure
 
 from ..measurement import ThicknessMap
 from ..results import Comparison, ExperimentSolution, to_xarray
-from .maps import draw_image, plot_pressure, plot_status, plot_thickness, shown_figure
+from . import layout
+from .drawing import DIVERGING, Drawn, draw_compression, draw_pressure, draw_status, draw_thickness
 
 _KPA = 1e3
-_SECTION_SIZE = (8.0, 4.4)  # inches
-_COMPARISON_SIZE = (12.6, 3.9)
-_REPORT_SIZE = (10.4, 8.4)
+_SECTION_WIDTH, _BESIDE, _ABOVE = 8.0, 1.6, 1.1  # inches; room beside and above the bodies for labels
 _LABELS = {"stress_zz": "−σ_zz, compression [kPa]", "mises": "von Mises stress [kPa]"}
+_LEAST_ERROR = 1e-6  # kPa at the ends of the colours: below is round-off
 _SAME = 1e-6  # difference of shear moduli that is none, relative
 
 Faces = Float[np.ndarray, "2 mz mx"]
@@ -68,7 +70,7 @@ def plot_section(
     sample, sample_stress = _cut(dataset, y, "sample_", "y_sample", "sample_element_stress", colour)
     both = np.concatenate([layer_stress.ravel(), sample_stress.ravel()])
     limits = (min(0.0, float(both.min())), float(np.percentile(both, 99.5)) if vmax is None else vmax)
-    ax = shown_figure(_SECTION_SIZE).subplots() if ax is None else ax
+    ax = layout.shown_figure(_section_size(dataset)).subplots() if ax is None else ax
     style: Any = {"cmap": cmap, "vmin": limits[0], "vmax": limits[1], "edgecolors": (0, 0, 0, 0.15), "linewidth": 0.2}
     for nodes, stress in ((layer, layer_stress), (sample, sample_stress)):
         colours = ax.pcolormesh(nodes[0], nodes[1], stress, shading="flat", **style)
@@ -78,7 +80,7 @@ def plot_section(
     for height in (0.0, plate):
         ax.axhline(height, color="black", linewidth=2.5)
     extend = "max" if both.max() > limits[1] else "neither"
-    ax.figure.colorbar(colours, ax=ax, label=_LABELS[colour], extend=extend, shrink=0.8)
+    ax.figure.colorbar(colours, ax=ax, label=_LABELS[colour], extend=extend, fraction=0.04, pad=0.02)
     room = 0.05 * plate
     ax.set(
         xlabel="x [mm]", ylabel="z [mm]", ylim=(plate + room, -room), aspect="equal", title=f"Section at y = {y:.3g} mm"
@@ -89,7 +91,7 @@ def plot_section(
 def plot_comparison(comparison: Comparison, figure: Figure | None = None, *, vmax: float | None = None) -> np.ndarray:
     """Draw true pressure, estimated pressure and their difference [kPa].
 
-    Oriented as MATLAB's imagesc: row 0 at the top. Places where one has no pressure are hatched grey.
+    Oriented as MATLAB's imagesc: row 0 at the top. Places where one has no pressure are grey.
 
     Args:
         comparison: What `compare` returned.
@@ -99,20 +101,22 @@ def plot_comparison(comparison: Comparison, figure: Figure | None = None, *, vma
     Returns:
         The three axes.
     """
-    axes = (shown_figure(_COMPARISON_SIZE) if figure is None else figure).subplots(1, 3)
     truth, estimate, error = (
         _KPA * part for part in (comparison.truth_pressure, comparison.estimate_pressure, comparison.error)
     )
-    top = float(np.nanmax(truth)) if vmax is None else vmax
-    off = max(float(np.nanpercentile(np.abs(error), 99.5)), 1e-6)
-    for ax, values, title, cmap, limits in (
-        (axes[0], truth, f"Truth, {comparison.truth.force:.3g} N", "viridis", (0.0, top)),
-        (axes[1], estimate, f"Estimate, {comparison.estimate.force:.3g} N", "viridis", (0.0, top)),
-        (axes[2], error, f"Estimate − truth, {comparison.relative_error:.1%}", "cividis", (-off, off)),
-    ):
-        draw_image(values, comparison.x, comparison.y, ax, "Contact pressure [kPa]", cmap, limits)
-        ax.set_title(title)
-    return axes
+    pressures = (0.0, float(np.nanmax(truth)) if vmax is None else vmax)
+
+    def panel(values: np.ndarray, label: str, cmap: str, colours: tuple[float, float]) -> Callable[[Axes], Axes]:
+        return lambda ax: layout.image(values, comparison.x, comparison.y, ax, label, cmap, colours)
+
+    panels = {
+        f"Truth, {comparison.truth.force:.3g} N": panel(truth, "Contact pressure [kPa]", "viridis", pressures),
+        f"Estimate, {comparison.estimate.force:.3g} N": panel(estimate, "Contact pressure [kPa]", "viridis", pressures),
+        f"Estimate − truth, {comparison.relative_error:.1%}": panel(
+            error, "Difference [kPa]", DIVERGING, layout.even(error, _LEAST_ERROR)
+        ),
+    }
+    return layout.draw_page(panels, layout.pixel_limits(comparison.x, comparison.y), figure)
 
 
 def draw_simulation(data: xr.Dataset, measured: ThicknessMap, y: float | None = None) -> dict[str, Figure]:
@@ -123,18 +127,25 @@ def draw_simulation(data: xr.Dataset, measured: ThicknessMap, y: float | None = 
         measured: The map as it would be measured.
         y: Where to cut [mm]; None takes the middle.
     """
-    section = Figure(figsize=_SECTION_SIZE, layout="compressed")
-    report = Figure(figsize=_REPORT_SIZE, layout="compressed")
+    section = Figure(figsize=_section_size(data), layout="compressed")
     plot_section(data, section.subplots(), y=y)
-    axes: Any = report.subplots(2, 2)
-    plot_thickness(measured, axes[0, 0])
-    plot_pressure(data, axes[0, 1])
-    plot_status(data, axes[1, 0])
-    plot_section(data, axes[1, 1], y=y)
-    axes[0, 0].set_title("Thickness as measured")
-    axes[0, 1].set_title(f"True pressure, {-data['force_sample'].values[2]:.3g} N")
-    axes[1, 0].set_title("Contact of layer and sample")
+    drawn = Drawn(data, measured)
+    panels = {
+        "Thickness as measured": partial(draw_thickness, drawn),
+        "Compression": partial(draw_compression, drawn),
+        f"True pressure, {-data['force_sample'].values[2]:.3g} N": partial(draw_pressure, drawn),
+        "Contact of layer and sample": partial(draw_status, drawn),
+        "Contact of layer and window": partial(draw_status, drawn, window=True),
+    }
+    report = layout.empty_page(len(panels), drawn.limits)
+    layout.draw_page(panels, drawn.limits, report)
     return {"section.png": section, "report.png": report}
+
+
+def _section_size(dataset: xr.Dataset) -> tuple[float, float]:
+    """Find the size of a picture [inch] that both bodies fill."""
+    height = float(dataset["sample_height"].values.max() / np.ptp(dataset["x_sample"].values))
+    return _SECTION_WIDTH, height * (_SECTION_WIDTH - _BESIDE) + _ABOVE
 
 
 def _cut(

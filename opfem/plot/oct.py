@@ -6,12 +6,14 @@ Edge of the chain: drawn from an `OctVolume` and its `Interface`. Depth is geome
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from ..measurement import ThicknessMap
 from ..measurement.oct import Interface, OctVolume
 from ..measurement.oct.volume import power
-from .maps import draw_image, plot_thickness, shown_figure
+from . import layout
 
 _UM = 1e3
 _SCANS = 3  # along both sides of the picture
@@ -23,7 +25,7 @@ _MOST_COLUMNS = 800
 
 
 def plot_interface(volume: OctVolume, interface: Interface, figure: Figure | None = None) -> np.ndarray:
-    """Draw nine B-scans with the interface (orange, and a band of two standard deviations; red dots: masked).
+    """Draw nine B-scans with the interface (orange, and a band of two standard deviations; blue dots: masked).
 
     Args:
         volume: The volume.
@@ -33,7 +35,7 @@ def plot_interface(volume: OctVolume, interface: Interface, figure: Figure | Non
     Returns:
         The nine axes, 3 × 3.
     """
-    figure = shown_figure(_SIZE) if figure is None else figure
+    figure = layout.shown_figure(_SIZE) if figure is None else figure
     ny = volume.shape[0]
     axes = figure.subplots(_SCANS, _SCANS, sharex=True, sharey=True)
     rows = np.unique(np.linspace(0, ny - 1, _SCANS**2 + 2).round().astype(int)[1:-1]) if ny > 2 else np.arange(ny)
@@ -53,9 +55,10 @@ def plot_interface(volume: OctVolume, interface: Interface, figure: Figure | Non
         depth, std = _UM * np.asarray(interface.depth)[row], _UM * np.asarray(interface.std)[row]
         known = np.where(kept[row], depth, np.nan)
         ax.fill_between(x, known - _BAND * std, known + _BAND * std, color="#e69f00", alpha=0.35, linewidth=0)
-        ax.plot(x, known, color="#e69f00", linewidth=0.8)
-        ax.plot(x[~kept[row]], depth[~kept[row]], ".", color="#d62728", markersize=1.5)
-        ax.set(title=f"y = {y[row]:.3g} mm", xlim=(x[0], x[-1]), ylim=(depths[levels][-1], depths[0]))
+        # Its dark rim keeps the line apart from the sample in a grey print.
+        ax.plot(x, known, color="#e69f00", linewidth=0.8, path_effects=[withStroke(linewidth=2.0, foreground="black")])
+        ax.plot(x[~kept[row]], depth[~kept[row]], ".", color="#56b4e9", markersize=2.5)
+        ax.set(title=f"y = {y[row]:.2f} mm", xlim=(x[0], x[-1]), ylim=(depths[levels][-1], depths[0]))
     for ax in axes[-1]:
         ax.set_xlabel("x [mm]")
     for ax in axes[:, 0]:
@@ -71,12 +74,23 @@ def draw_interface(volume: OctVolume, interface: Interface, thickness: Thickness
         interface: The interface found in it.
         thickness: The map made of it.
     """
-    scans, maps = Figure(figsize=_SIZE, layout="compressed"), Figure(figsize=(12.0, 4.2), layout="compressed")
+    x, y, missing = np.asarray(interface.x), np.asarray(interface.y), np.asarray(interface.mask)
+
+    def panel(values: np.ndarray, label: str, cmap: str, colours: tuple[float, float] | None = None) -> Any:
+        def draw(ax: Axes) -> None:
+            layout.image(values, x, y, ax, label, cmap, colours)
+            layout.hatch_missing(ax, missing, x, y)
+
+        return draw
+
+    std, found = (np.where(missing, np.nan, _UM * np.asarray(v)) for v in (interface.std, thickness.values))
+    panels = {
+        "Confidence": panel(np.asarray(interface.confidence), "Confidence", "cividis", (0.0, 1.0)),
+        "Standard deviation of depth": panel(std, "Std of depth [µm]", "cividis"),
+        "Thickness": panel(found, "Thickness [µm]", "viridis"),
+    }
+    limits = layout.pixel_limits(x, y)
+    scans, maps = Figure(figsize=_SIZE, layout="compressed"), layout.empty_page(len(panels), limits)
     plot_interface(volume, interface, scans)
-    axes: Any = maps.subplots(1, 3)
-    x, y = np.asarray(interface.x), np.asarray(interface.y)
-    draw_image(np.asarray(interface.confidence), x, y, axes[0], "Confidence", "cividis", (0.0, 1.0))
-    std = np.where(np.asarray(interface.mask), np.nan, _UM * np.asarray(interface.std))
-    draw_image(std, x, y, axes[1], "Standard deviation of depth [µm]", "cividis", None)
-    plot_thickness(thickness, axes[2])
+    layout.draw_page(panels, limits, maps)
     return {"bscans.png": scans, "maps.png": maps}

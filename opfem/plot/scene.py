@@ -2,7 +2,10 @@
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import xarray as xr
+from jaxtyping import Float
+from matplotlib.ticker import MaxNLocator
 
 from ..io import layer_grid
 from ..results import ExperimentSolution, Solution, to_xarray
@@ -25,7 +28,9 @@ def plot_layer(
 ) -> "pyvista.Plotter":
     """Put the deformed layer into a 3-D scene, coloured on its top by what the sample does to it [kPa].
 
-    The scene is returned, not shown: call `.show()` on it, or `.screenshot(path)` on one that is off screen.
+    It lies as on the maps, x to the right and y towards the viewer, its face at the sample up: the mirror image of the
+    layer itself, as a map is that is looked at from the sample. The scene is returned, not shown: call `.show()` on it,
+    or `.screenshot(path)` on one that is off screen.
 
     Args:
         data: A solution, or its dataset.
@@ -62,30 +67,63 @@ def plot_layer(
         edge_opacity=0.2,
         scalar_bar_args=_BAR,
     )
-    scene.set_scale(zscale=stretch_z)
-    # The ranges are given because the scene would label its stretched ones.
-    titles = {"xtitle": "x [mm]", "ytitle": "y [mm]", "ztitle": "z [mm]"}
-    scene.show_bounds(**titles, axes_ranges=list(grid.bounds), location="outer", color="black", **_LABELS)
+    scene.set_scale(yscale=-1.0, zscale=stretch_z)
+    _draw_axes(scene, grid.bounds, np.array([1.0, -1.0, stretch_z]))
     if stretch_z != 1.0:
-        scene.add_text(f"z stretched {stretch_z:g} times", font_size=9, color="black")
+        scene.add_text(f"z stretched {stretch_z:g} times", font_size=_FONT // 2, color="black")
     scene.set_background("white")
-    scene.camera_position = [(-0.9, -1.25, 1.1), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
+    scene.camera_position = [(-0.3, -1.3, 1.15), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
     scene.reset_camera()
-    scene.camera.zoom(0.9)
+    scene.camera.zoom(1.05)
     return scene
 
 
-_LABELS: Any = {"n_xlabels": 4, "n_ylabels": 4, "n_zlabels": 2, "fmt": "%.1f", "font_size": 14, "padding": 0.03}
+_FONT = 16
+_TICK, _TICKS = 0.02, {"x": 5, "y": 5, "z": 2}  # length over the longest side, and most intervals
 _BAR: Any = {
-    "title_font_size": 16,
-    "label_font_size": 16,
+    "title_font_size": _FONT,
+    "label_font_size": _FONT,
     "fmt": "%.3g",
-    "vertical": True,
+    "vertical": False,
     "color": "black",
-    "position_x": 0.85,
-    "position_y": 0.15,
-    "height": 0.7,
+    "n_labels": 4,  # none in the middle, where the title is
+    "position_x": 0.28,
+    "position_y": 0.87,
+    "width": 0.68,
+    "height": 0.1,
 }
+
+
+def _draw_axes(scene: Any, bounds: Any, scale: Float[np.ndarray, "3"]) -> None:
+    """Draw the axes along the edges nearest to the viewer, with ticks at round numbers."""
+    low, high = np.array(bounds).reshape(3, 2).T
+    left, right = np.array([low[0], high[1], low[2]]), np.array([high[0], high[1], low[2]])
+    tick = _TICK * float(np.max(high - low))
+    places = {"x": (left, (0.0, tick, 0.0)), "y": (left, (-tick, 0.0, 0.0)), "z": (right, (tick, 0.0, 0.0))}
+    for axis, (name, (corner, outward)) in enumerate(places.items()):
+        ticks = MaxNLocator(_TICKS[name], steps=[1, 2, 5, 10]).tick_values(low[axis], high[axis])
+        ticks = ticks[(ticks >= low[axis] - 1e-9) & (ticks <= high[axis] + 1e-9)]
+        at = np.repeat(corner[None], ticks.size, axis=0)
+        at[:, axis] = ticks
+        ends = np.repeat(corner[None], 2, axis=0)
+        ends[:, axis] = low[axis], high[axis]
+        out = np.array(outward)
+        scene.add_lines(np.concatenate([ends, np.stack([at, at + out], axis=1).reshape(-1, 3)]), color="black", width=2)
+        middle = ends.mean(axis=0) + 5.0 * out
+        # Labels, unlike all else, are not scaled with the scene.
+        labels = [*(f"{tick:g}" for tick in ticks), f"{name} [mm]"]
+        scene.add_point_labels(
+            scale * np.concatenate([at + 2.2 * out, middle[None]]),
+            labels,
+            font_size=_FONT,
+            text_color="black",
+            bold=False,
+            shape=None,
+            show_points=False,
+            always_visible=True,
+            justification_horizontal="center",
+            justification_vertical="center",
+        )
 
 
 def _new_scene(off_screen: bool) -> "pyvista.Plotter":

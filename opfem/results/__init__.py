@@ -2,12 +2,14 @@
 
 from ..inverse import Calibration, TractionFit
 from ..solvers import ExperimentSolution, Solution
+from .cautions import residual_rms
 from .compare import Comparison, FieldMetrics, compare
 from .dataset import to_xarray
 from .interior import LayerFields, layer_fields, sample_fields
 from .measured import measured_thickness
 from .oct_scene import OctScene, oct_scene
-from .summary import summary, summary_rows
+from .pixels import on_pixels
+from .summary import area_rows, pressure_rows, summary, summary_rows
 
 __all__ = [
     "Calibration",
@@ -18,10 +20,14 @@ __all__ = [
     "OctScene",
     "Solution",
     "TractionFit",
+    "area_rows",
     "compare",
     "layer_fields",
     "measured_thickness",
     "oct_scene",
+    "on_pixels",
+    "pressure_rows",
+    "residual_rms",
     "sample_fields",
     "summary",
     "summary_rows",

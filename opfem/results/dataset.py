@@ -16,7 +16,7 @@ from ..model import Imprint
 from ..solvers import CONVERGED, RESULTS, ExperimentSolution, FaceResult, Solution
 from ..solvers.solution import OPEN, is_failure
 from .bodies import SAMPLE_NODES, interior_variables, sample_coordinates, sample_record, sample_variables
-from .fields import pressure_image
+from .fields import node_areas, pressure_image, under_pixels
 from .interior import layer_fields
 from .labels import NODES, Variable, variable
 from .provenance import describe, inputs_hash, steps_as_json, versions
@@ -90,8 +90,8 @@ def to_xarray(solution: Solution | ExperimentSolution | TractionFit, *, interior
     """Label a solution, or a fit: dims, positions, units, and how it was made.
 
     Everything is in mm, N and MPa. Interface nodes are `y`, `x`; `x_current` and `y_current` say where
-    they have moved. `thickness` and `pressure_image` are on the pixels of the load's map, NaN where no
-    interface point lies under a pixel. Fields of a failed solve are NaN, its `contact_status` -1.
+    they have moved. `thickness`, `compression` (1 - L1/L0) and `pressure_image` are on the pixels of the load's map,
+    NaN where no interface point lies under a pixel. Fields of a failed solve are NaN, its `contact_status` -1.
     Of an experiment these are the layer's, on pixels at its nodes; names of the sample's fields begin with
     `sample_`, of those at the plate with `plate_`, on nodes `y_sample`, `x_sample`.
 
@@ -119,15 +119,16 @@ def to_xarray(solution: Solution | ExperimentSolution | TractionFit, *, interior
     failed = status_name(solution) not in CONVERGED
     variables = {
         **_volume(solution),
-        **_face("", "at the sample", solution.interface, failed),
-        **_face("window_", "at the window", solution.window, failed),
+        **_face("", "at the sample", solution.interface, _surface(solution, -1), failed),
+        **_face("window_", "at the window", solution.window, _surface(solution, 0), failed),
         **_image(solution),
         **_stats(solution.stats, STATS if isinstance(solution, Solution) else STATS | EXPERIMENT_STATS),
         **(interior_variables(layer_fields(solution)) if interior else {}),
     }
     coordinates = _coordinates(solution)
     if isinstance(solution, ExperimentSolution):
-        variables |= _face("plate_", "at the plate", solution.plate, failed, "sample", SAMPLE_NODES[1:])
+        plate = np.asarray(solution.sample.positions[:, -1] + solution.sample.displacement[:, -1])
+        variables |= _face("plate_", "at the plate", solution.plate, plate, failed, "sample", SAMPLE_NODES[1:])
         variables |= sample_variables(solution, interior)
         coordinates |= sample_coordinates(solution)
     if interior or isinstance(solution, ExperimentSolution):
@@ -193,10 +194,19 @@ def _coordinates(solution: Solution | ExperimentSolution) -> dict[str, Variable]
     }
 
 
+def _surface(solution: Solution | ExperimentSolution, level: int) -> np.ndarray:
+    """Locate the nodes of the layer's lower (0) or upper (-1) face where they are now [mm]."""
+    return np.asarray(solution.positions[:, level] + solution.displacement[:, level])
+
+
 def _volume(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
+    L0, u = np.asarray(solution.positions[2, -1]), np.asarray(solution.displacement[2])
     return {
         "displacement": variable(("component", "z", *NODES), solution.displacement, "mm", "displacement"),
-        "unloaded_thickness": variable(NODES, solution.positions[2, -1], "mm", "unloaded thickness L0"),
+        "unloaded_thickness": variable(NODES, L0, "mm", "unloaded thickness L0"),
+        "nominal_strain": variable(
+            NODES, (u[-1] - u[0]) / L0, "1", "nominal strain along z, mean over the thickness, tension positive"
+        ),
         "stress_zz": variable(
             ("y_element", "x_element"),
             solution.stress_zz,
@@ -207,7 +217,13 @@ def _volume(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
 
 
 def _face(
-    prefix: str, where: str, face: FaceResult, failed: bool, body: str = "layer", nodes: tuple[str, ...] = NODES
+    prefix: str,
+    where: str,
+    face: FaceResult,
+    current: np.ndarray,
+    failed: bool,
+    body: str = "layer",
+    nodes: tuple[str, ...] = NODES,
 ) -> dict[str, Variable]:
     status = np.full(face.status.shape, NOT_CONVERGED) if failed else np.asarray(face.status)
     return {
@@ -218,6 +234,9 @@ def _face(
             ("component", *nodes), face.traction, "MPa", f"force on the {body} {where} per reference area"
         ),
         f"{prefix}slip": variable(("lateral", *nodes), face.slip, "mm", f"tangential slip {where}"),
+        f"{prefix}node_area": variable(
+            nodes, node_areas(*current), "mm2", f"current area that belongs to each node {where}"
+        ),
         f"{prefix}contact_status": variable(
             nodes,
             status.astype(np.int8),
@@ -231,11 +250,12 @@ def _face(
 
 def _image(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
     grid = solution.thickness
-    outside = np.asarray(grid.mask)
+    thickness = np.where(grid.mask, np.nan, grid.values)
+    X, place = np.asarray(solution.positions[:, -1]), np.meshgrid(grid.x, grid.y)
+    L0 = under_pixels(X[2], X[:2], np.zeros_like(X[:2]), *place)
     images = {
-        "thickness": variable(
-            IMAGE, np.where(outside, np.nan, grid.values), "mm", "computed thickness of the loaded layer"
-        ),
+        "thickness": variable(IMAGE, thickness, "mm", "computed thickness of the loaded layer"),
+        "compression": variable(IMAGE, 1.0 - thickness / L0, "1", "compression of the layer, 1 - L1/L0"),
         "pressure_image": variable(
             IMAGE, pressure_image(solution), "MPa", "contact pressure at the sample under each pixel"
         ),

@@ -13,27 +13,27 @@ from ..solvers.compiling import QuickJit
 
 
 def under_pixels(
-    field: Float[np.ndarray, "my mx"],
+    field: Float[np.ndarray, "*fields my mx"],
     positions: Float[np.ndarray, "2 my mx"],
     lateral: Float[np.ndarray, "2 my mx"],
     x: Float[np.ndarray, "py px"],
     y: Float[np.ndarray, "py px"],
-) -> Float[np.ndarray, "py px"]:
-    """Read an interface field at spatial points: at the interface point that has moved there.
+) -> Float[np.ndarray, "*fields py px"]:
+    """Read interface fields at spatial points: at the interface point that has moved there.
 
     Args:
-        field: Values at the interface nodes.
+        field: Values at the interface nodes, of one field or of several.
         positions: Reference x and y of the interface nodes, a regular grid from 0 [mm].
         lateral: Displacement of these nodes along x and y [mm].
         x: Spatial positions along image columns [mm].
         y: Spatial positions along image rows [mm].
 
     Returns:
-        The field at these points, in its own unit; NaN where no interface point lies.
+        The fields at these points, in their own units; NaN where no interface point lies.
     """
-    return np.asarray(
-        _under_pixels(*(jnp.asarray(v) for v in (field, positions[:, -1, -1], lateral, np.stack([x, y]))))
-    )
+    stacked = field.reshape(-1, *field.shape[-2:])
+    found = _under_pixels(*(jnp.asarray(v) for v in (stacked, positions[:, -1, -1], lateral, np.stack([x, y]))))
+    return np.asarray(found).reshape(*field.shape[:-2], *x.shape)
 
 
 def pressure_image(solution: Solution | ExperimentSolution) -> Float[Array, "py px"]:
@@ -44,16 +44,16 @@ def pressure_image(solution: Solution | ExperimentSolution) -> Float[Array, "py 
     """
     grid, surface = solution.thickness, solution.positions[:2, -1]
     place = jnp.stack(jnp.meshgrid(grid.x, grid.y))
-    pressure = _under_pixels(solution.pressure, surface[:, -1, -1], solution.displacement[:2, -1], place)
-    return jnp.where(grid.mask, jnp.nan, pressure)
+    pressure = _under_pixels(solution.pressure[None], surface[:, -1, -1], solution.displacement[:2, -1], place)
+    return jnp.where(grid.mask, jnp.nan, pressure[0])
 
 
 @QuickJit
-def _under_pixels(field: Array, far: Array, lateral: Array, place: Array) -> Array:
-    my, mx = field.shape
+def _under_pixels(fields: Array, far: Array, lateral: Array, place: Array) -> Array:
+    my, mx = lateral.shape[1:]
     size = far / jnp.array([mx - 1, my - 1])
     below = locate(NodalField(lateral, size), place, far, size)
-    return jnp.where(jnp.all(below.found, axis=0), NodalField(field[None], size)(*below.at)[0][0], jnp.nan)
+    return jnp.where(jnp.all(below.found, axis=0), NodalField(fields, size)(*below.at)[0], jnp.nan)
 
 
 def node_areas(

@@ -99,6 +99,11 @@ class Progress:
                 text += self._display.time_left(fraction)
             self._display.put(self._display.now._replace(text=text, fraction=fraction))
 
+    def line(self, text: str) -> None:
+        """Say something once, in a log only, where the stage is not one of a short library call."""
+        if self._display is not None:
+            self._display.line(text)
+
 
 class _Display:
     """What the outermost `Progress` and all inside share: what is shown, and a thread that keeps it up to date."""
@@ -153,6 +158,13 @@ class _Display:
         if self._bar is not None or (self._patience == 0 and now.stage > self._said[0]):
             self._update(False)
 
+    def line(self, text: str) -> None:
+        """Print a line in a log; a terminal and a notebook show how far all is instead."""
+        time = self._time()
+        if self._bar is None and self._handle is None and time - self.now.since >= self._patience:
+            with self._lock:
+                self._print(text, time)
+
     def stop(self) -> None:
         """Leave nothing behind on a terminal."""
         self._ended.set()
@@ -185,9 +197,13 @@ class _Display:
         with self._lock:
             news = state > self._said and age >= self._patience
             if news or time - self._last >= max(_EVERY, self._patience):
-                self._said, self._last = max(state, self._said), time
-                line = f"opfem {time - self._begin:4.0f} s  {text}"
-                self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+                self._said = max(state, self._said)
+                self._print(text, time)
+
+    def _print(self, text: str, time: float) -> None:
+        self._last = time
+        line = f"opfem {time - self._begin:4.0f} s  {text}"
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def _write(self, line: str) -> None:
         if line != self._written:

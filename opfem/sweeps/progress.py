@@ -1,8 +1,11 @@
-"""How far a sweep is: points, rate, failures, time left."""
+"""How far a sweep is: points, rate, failures, time left; in a log a line for each point."""
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from ..solvers.progress import Progress
+from .store import Outcome
 
 
 class SweepProgress:
@@ -19,12 +22,22 @@ class SweepProgress:
         self._total, self._finished, self._done, self._failed = total, finished, 0, 0
         self._begin = time.perf_counter()
 
-    def show(self, done: int, failed: int) -> None:
-        """Count points that have just been finished."""
-        self._done += done
-        self._failed += failed
+    def finished(self, point: Mapping[str, Any], outcome: Outcome) -> None:
+        """Count a point that has just been finished.
+
+        Args:
+            point: Its value on each axis.
+            outcome: How it ended.
+        """
+        self._done += 1
+        self._failed += outcome.failed
         reached = self._finished + self._done
         self._shown.show(f"{reached} of {self._total} points, {self.text()}", reached / self._total)
+        place = ", ".join(
+            f"{name} {value if isinstance(value, str) else f'{value:.6g}'}" for name, value in point.items()
+        )
+        ended = outcome.status if outcome.failed else f"{outcome.seconds:.3g} s"
+        self._shown.line(f"{reached} of {self._total} points: {place}: {ended}; {self.text()}")
 
     def text(self) -> str:
         """Say rate, failures and time left; compilation counts as time of the first points."""

@@ -16,7 +16,7 @@ from ..io import whole_file, write_whole
 from .outputs import GOOD, Label
 from .plan import Plan
 
-PLAN, POINTS, FINISHED = "sweep.json", "points", "result.nc"
+PLAN, POINTS, TABLE, FINISHED = "sweep.json", "points", "table.csv", "result.nc"
 
 
 @dataclasses.dataclass(frozen=True)

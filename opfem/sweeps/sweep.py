@@ -13,16 +13,17 @@ from typing import Any
 import jax
 import xarray as xr
 
-from ..io import write_netcdf
+from ..io import write_netcdf, write_whole
 from ..solvers.progress import Progress
 from .cluster import Cluster
+from .columns import csv_bytes
 from .design import Points, check_arguments, grid
 from .execution import Batch, Columns, Devices, Program
 from .keys import environment, hash_of
 from .outputs import ERROR, Keep, OutputError, Outputs
 from .plan import Plan
 from .progress import SweepProgress
-from .store import FINISHED, Folder, Memory, Outcome
+from .store import FINISHED, TABLE, Folder, Memory, Outcome
 from .table import table
 
 Execution = Batch | Devices | Cluster
@@ -57,7 +58,8 @@ def sweep(
         units: Units of axes and of outputs that have none of their own.
         execution: `Batch`, `Devices` or `Cluster`.
         out: Folder that keeps every finished point: a sweep that was interrupted goes on where it was when it is
-            called again, and ends as if it had not been. None keeps nothing.
+            called again, and ends as if it had not been. The whole is `result.nc`, numbers are `table.csv`, too. None
+            keeps nothing.
         progress: Say how far it is, on a terminal, in a notebook or, where it takes long, on stderr.
 
     Returns:
@@ -104,6 +106,7 @@ def sweep(
     }
     data = table(points, lambda i: errors[i] if i in errors else store.read(i), attributes)
     if out is not None:
+        write_whole(Path(out) / TABLE, csv_bytes(data))
         write_netcdf(data, Path(out) / FINISHED)
     return data
 
@@ -178,7 +181,7 @@ def _run(
                 errors[i] = outcome
             elif not store.has(i):
                 store.write(i, outcome)
-        bar.show(len(batch), sum(outcome.failed for outcome in outcomes))
+            bar.finished({name: column[i] for name, column in points.columns.items()}, outcome)
     return errors
 
 

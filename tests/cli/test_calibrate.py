@@ -48,6 +48,14 @@ def test_a_law_from_a_file(curve, tmp_path, capsys):
     assert "--force" in capsys.readouterr().err
 
 
+def test_drawings_come_and_go_with_the_result(curve, tmp_path):
+    out = tmp_path / "out"
+    assert opfem("calibrate", curve, "--svg", "--out", out) == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "calibration.svg"])
+    assert opfem("calibrate", curve, "--pdf", "--out", out, "--force") == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "calibration.pdf"])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -12,7 +12,7 @@ from opfem import cli
 from tests.decks.texts import imprint_deck, stacked_deck, text
 from tests.experiments import bumpy_map, inclusion_experiment, published_palpation
 
-FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", "result.nc")
+FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
 
 
 def opfem(*arguments) -> int:
@@ -96,6 +96,7 @@ def test_steps_are_solved_in_a_row(tmp_path, capsys):
     assert numbers["step"] == "STEP-2"
     assert numbers["force_sample_N"][2] < numbers["steps"][0]["force_sample_N"][2] < 0
     assert any("facets" in said for said in numbers["deck"]["assumed"])
+    assert json.loads(last.attrs["assumptions"]) == numbers["deck"]["assumed"]
     assert opfem("deck", tmp_path / "two.inp", "--out", out) == 1
     assert "--force to replace it" in capsys.readouterr().err
 

@@ -12,14 +12,15 @@ import equinox as eqx
 import numpy as np
 import pytest
 import pyvista
+import scipy.io
 import xarray as xr
 from PIL import Image
 
 import opfem as op
 from opfem import cli
 
-FILES = ("result.vtu", "pressure.png", "report.png", "summary.json", "result.nc")
-FIT_FILES = ("result.vtu", "pressure.png", "fit.png", "summary.json", "result.nc")
+FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
+FIT_FILES = ("result.vtu", "pressure.png", "fit.png", "report.html", "summary.json", "result.nc")
 SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
 
 
@@ -98,7 +99,7 @@ def test_palpate_from_map_to_files(tmp_path, map_file, capsys):
     said = capsys.readouterr().out
     assert "Assumed: c10, c01, bulk" in said
     assert "1 missing and filled" in said
-    assert f"{numbers['pressure_mean_kPa']:.3g}" in said
+    assert f"{numbers['pressure_mean_touching_kPa']:.3g}" in said
     assert "kPa" in said
 
 
@@ -120,6 +121,31 @@ def test_fit_from_map_to_files(tmp_path, map_file, spread):
     assert pyvista.read(out / "result.vtu").n_cells == 72
 
 
+def test_report_says_what_was_given_and_what_assumed(tmp_path, map_file, solved):
+    given = ("--c10", "0.003", "--bulk", "0.2", "--window-friction=0.15", "--elements", "6", "6", "2")
+    assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.5, *given, "--out", tmp_path / "a") == 0
+    attrs = op.read_netcdf(tmp_path / "a" / "result.nc").attrs
+    assert (
+        attrs["command"] == f"opfem palpate {map_file} --extent 2 2 --l0 0.5 {' '.join(given)} --out {tmp_path / 'a'}"
+    )
+    assumed = set(json.loads(attrs["assumed"]))
+    assert {"layer.material.c01", "sample.friction", "sample.law.pressure", "smooth", "element"} <= assumed
+    assert not {"layer.material.c10", "layer.material.bulk", "window.friction", "elements"} & assumed
+    page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    assert "Assumed, because nobody said otherwise. Layer: sides, C01; Window: contact law; Sample: contact law" in page
+    assert attrs["command"] in page
+
+
+def test_no_report(tmp_path, map_file, solved):
+    assert opfem("palpate", map_file, *SMALL, "--no-report", "--out", tmp_path / "a") == 0
+    assert sorted(os.listdir(tmp_path / "a")) == sorted(set(FILES) - {"report.html"})
+    # One that is replaced goes with the rest of its result.
+    assert opfem("palpate", map_file, *SMALL, "--force", "--out", tmp_path / "a") == 0
+    assert (tmp_path / "a" / "report.html").is_file()
+    assert opfem("palpate", map_file, *SMALL, "--no-report", "--force", "--out", tmp_path / "a") == 0
+    assert not (tmp_path / "a" / "report.html").exists()
+
+
 def test_defaults_are_the_published_case(tmp_path, map_file, solved):
     assert opfem("palpate", map_file, "--extent", 2, 2, "--l0", 0.5, "--out", tmp_path / "o") == 0
     palpation, load, solver = solved[0]
@@ -135,6 +161,30 @@ def test_defaults_are_the_published_case(tmp_path, map_file, solved):
     # Half an element.
     assert float(load.thickness.steps[-1].numbers["fwhm"]) == pytest.approx(0.025)
     assert not load.correct_approach
+
+
+def test_files_for_other_programs_come_and_go_with_the_result(tmp_path, map_file, solved, loaded):
+    out = tmp_path / "o"
+    asked = ("--also", "csv", "mat", "tiff", "--pdf", "--svg")
+    assert opfem("palpate", map_file, *SMALL, *asked, "--out", out) == 0
+    drawings = {f"{name}.{kind}" for name in ("pressure", "report") for kind in ("pdf", "svg")}
+    assert set(os.listdir(out)) == {*FILES, *drawings, "result.csv", "result.tif", "result.mat"}
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert b"<svg" in (out / "pressure.svg").read_bytes()[:1000]
+    held = scipy.io.loadmat(out / "result.mat")
+    # The map as measured, neither filled nor smoothed.
+    np.testing.assert_allclose(held["measured_um"], 1e3 * np.load(map_file))
+    assert opfem("palpate", map_file, *SMALL, "--out", out, "--force") == 0
+    assert set(os.listdir(out)) == set(FILES)
+
+
+def test_warnings_are_printed_in_options_and_kept(tmp_path, map_file, solved, capsys):
+    """Noise of 10 nm, which no mesh follows."""
+    assert opfem("palpate", map_file, *SMALL, "--std", 1e-5, "--out", tmp_path / "o") == 0
+    said = "The mesh does not follow the map"
+    assert said in capsys.readouterr().out
+    numbers = json.loads((tmp_path / "o" / "summary.json").read_text(encoding="utf-8"))
+    assert [warning.partition(":")[0] for warning in numbers["warnings"]] == [said]
 
 
 def test_options_arrive(tmp_path, map_file, solved):

@@ -53,7 +53,7 @@ pixel = 0.05
 std = 0.002
 seed = 3
 """
-FILES = ("map.npz", "result.vtu", "section.png", "report.png", "summary.json", "result.nc")
+FILES = ("map.npz", "result.vtu", "section.png", "report.png", "report.html", "summary.json", "result.nc")
 
 
 def opfem(*arguments) -> int:

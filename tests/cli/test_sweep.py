@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 
 import opfem as op
 from opfem import cli
@@ -57,8 +58,19 @@ def test_from_file_to_table_and_on(config, tmp_path, capsys, monkeypatch):
         monkeypatch.setattr(f"opfem.cli.{command}.Newton", functools.partial(op.Newton, rtol=SOLVER / 10))
     out = tmp_path / "out"
     assert opfem("sweep", config, "--out", out) == 0
-    assert "4 points, 0 failed" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "4 points, 0 failed. Wrote table.csv, sweep.png, result.nc" in said.out
     data = op.read_netcdf(out / "result.nc")
+    # A stiffer layer with more friction feels the most.
+    low, high = 1e3 * float(data.max_pressure.min()), 1e3 * float(data.max_pressure.max())
+    assert (
+        f"max_pressure: lowest {low:.4g} kPa at c10 2 kPa, window_friction 0; "
+        f"highest {high:.4g} kPa at c10 4 kPa, window_friction 0.2"
+    ) in said.out
+    for point in ("c10 0.002, window_friction 0: ", "c10 0.004, window_friction 0.2: "):
+        assert sum(point in line and " of 4 points: " in line for line in said.err.splitlines()) == 1
+    with Image.open(out / "sweep.png") as image:
+        assert min(image.size) > 500
     assert data.max_pressure.dims == ("c10", "window_friction")
     np.testing.assert_allclose(data.c10, [2e-3, 4e-3])
     assert data.c10.attrs["units"] == "MPa"

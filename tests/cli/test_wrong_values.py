@@ -71,6 +71,10 @@ SOLVER = [
 ]
 FLAGS = [(f"--{name}=maybe", None, None, "must be given without a value", "'maybe'") for name in ("force", "debug")]
 FLAGS += [("--no-cache=maybe", None, None, "must be given without a value", "'maybe'")]
+FILES = [
+    ("--also", "xls", None, "must be one of csv, tiff, mat", "'xls'"),
+    *((f"--{name}=maybe", *FLAGS[0][1:]) for name in ("pdf", "svg", "report", "no-report")),
+]
 OUT = [("--out", "a_file", None, "Cannot write results to", "a_file")]
 FIT = [
     ("--prior-length", "0", "mm", A_NUMBER, "0"),
@@ -102,11 +106,11 @@ DECK = [
     ("--info=maybe", None, None, "must be given without a value", "'maybe'"),
 ]
 TABLE = {
-    "palpate": [*MAPS, *LAYER, *CONTACT, *APPROACH, *SOLVER, *WRITE, *FLAGS, *OUT],
-    "deck": [*DECK, *FLAGS, *OUT],
-    "fit": [*MAPS, *LAYER, *CONTACT, *FIT, *SOLVER[1:3], *FLAGS, *OUT],
-    "demo": [*SOLVER, *FLAGS, *OUT, ("--coin=maybe", None, None, "must be given without a value", "'maybe'")],
-    "sweep": [*FLAGS, *OUT, ("--resume=maybe", None, None, "must be given without a value", "'maybe'")],
+    "palpate": [*MAPS, *LAYER, *CONTACT, *APPROACH, *SOLVER, *WRITE, *FILES, *FLAGS, *OUT],
+    "deck": [*DECK, *FILES, *FLAGS, *OUT],
+    "fit": [*MAPS, *LAYER, *CONTACT, *FIT, *SOLVER[1:3], *FILES, *FLAGS, *OUT],
+    "demo": [*SOLVER, *FILES, *FLAGS, *OUT, ("--coin=maybe", None, None, "must be given without a value", "'maybe'")],
+    "sweep": [*FILES[1:3], *FLAGS, *OUT, ("--resume=maybe", None, None, "must be given without a value", "'maybe'")],
 }
 ROWS = [(command, *row) for command, rows in TABLE.items() for row in rows]
 CONFIG = (

@@ -141,7 +141,7 @@ def test_a_solution_in_which_nothing_touches_says_so():
     assert numbers["status"] == "successful"
     assert numbers["status_message"].startswith("Nothing touches: ")
     assert op.to_xarray(solution).attrs["status_message"].startswith("Nothing touches: ")
-    assert numbers["contact_area_fraction"] == 0.0
+    assert numbers["contact_area_mm2"] == 0.0
     assert numbers["force_imbalance_percent"] is None
     assert ("force on the layer, normal", "0", "N") in rows
     assert not any(value.startswith("-") for _, value, _ in rows)

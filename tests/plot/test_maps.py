@@ -8,11 +8,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.contour import ContourSet
 from PIL import Image
 
 import opfem as op
-from opfem.plot import draw_pictures, plot_pressure, plot_residual, plot_status, plot_thickness
-from opfem.plot.maps import STATUS_COLOURS
+from opfem.plot import draw_pictures, plot_compression, plot_pressure, plot_residual, plot_status, plot_thickness
+from opfem.plot.drawing import DIVERGING, STATUS_COLOURS
+from opfem.plot.layout import page
 from tests import tolerances as tol
 
 
@@ -22,7 +24,8 @@ def dataset(solution):
 
 
 def colour_bar(ax):
-    return next(other for other in ax.figure.axes if other is not ax)
+    (bar,) = ax.child_axes
+    return bar
 
 
 def render(figure) -> np.ndarray:
@@ -38,6 +41,7 @@ def pictures(dataset, loaded):
         "window": plot_pressure(dataset, window=True),
         "status": plot_status(dataset),
         "thickness": plot_thickness(loaded),
+        "compression": plot_compression(dataset),
         "residual": plot_residual(dataset, loaded),
     }
 
@@ -48,7 +52,7 @@ def _closed():
     plt.close("all")
 
 
-NAMES = ["pressure", "window", "status", "thickness", "residual"]
+NAMES = ["pressure", "window", "status", "thickness", "compression", "residual"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -110,8 +114,9 @@ def test_status_colours_differ_in_grey():
 
 def test_status_key(pictures, dataset):
     labels = [label.get_text() for label in colour_bar(pictures["status"]).get_yticklabels()]
-    shares = [float((dataset.contact_status == code).mean()) for code in range(3)]
-    assert labels == [f"{name}\n{share:.0%}" for name, share in zip(("open", "stick", "slip"), shares, strict=True)]
+    areas = [float(dataset.node_area.where(dataset.contact_status == code, 0.0).sum()) for code in range(3)]
+    assert labels == [f"{name}\n{area:.3g}" for name, area in zip(("open", "stick", "slip"), areas, strict=True)]
+    assert colour_bar(pictures["status"]).get_ylabel() == "Contact status, area [mm²]"
 
 
 def test_thickness_in_um_and_missing_pixels(pictures, loaded):
@@ -125,6 +130,44 @@ def test_thickness_in_um_and_missing_pixels(pictures, loaded):
     assert ax.images[0].get_extent() == pytest.approx((-0.05, 2.05, 2.0625, -0.0625))
 
 
+def test_compression_in_percent(pictures, dataset):
+    ax = pictures["compression"]
+    shown = ax.images[0].get_array()
+    np.testing.assert_allclose(shown, 100.0 * (1.0 - dataset.thickness / 0.5), rtol=tol.ROUNDOFF, atol=1e-12)
+    assert colour_bar(ax).get_ylabel() == "Compression [%]"
+
+
+def test_missing_pixels_are_hatched_on_every_map(pictures):
+    for name in NAMES:
+        assert [text.get_text() for text in pictures[name].get_legend().get_texts()] == ["no data"]
+
+
+@pytest.fixture
+def lifted(dataset):
+    """Contact lost where x is above 1 mm."""
+    changed = dataset.copy(deep=True)
+    changed["contact_status"] = dataset.contact_status.where(dataset.x < 1.1, 0)
+    return changed
+
+
+def test_open_area_is_hatched_and_contact_outlined(lifted, loaded):
+    for ax in (plot_pressure(lifted), plot_status(lifted), plot_compression(lifted), plot_residual(lifted, loaded)):
+        filled, *lines = [part for part in ax.collections if isinstance(part, ContourSet)][-3:]
+        assert filled.hatches == [".."]
+        # The outline runs midway between the last node that touches and the first that does not.
+        (outline,) = lines[-1].get_paths()
+        moved = lifted.x_current.values[:, 3:5].mean(axis=1)
+        assert moved.min() - 1e-9 <= outline.vertices[:, 0].min() <= outline.vertices[:, 0].max() <= moved.max() + 1e-9
+        assert "open" in [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def test_an_air_gap_is_no_residual(lifted, loaded):
+    shown = plot_residual(lifted, loaded).images[0].get_array()
+    x = np.asarray(loaded.x)
+    assert shown.mask[:, x > 1.3].all()
+    assert not shown.mask[5:, x < 1.0].any()
+
+
 def test_residual_is_measured_less_computed(pictures, dataset, loaded):
     expected = 1e3 * (np.asarray(loaded.values) - dataset.thickness.values)
     shown = pictures["residual"].images[0].get_array()
@@ -133,20 +176,70 @@ def test_residual_is_measured_less_computed(pictures, dataset, loaded):
     assert low == -high
 
 
-def test_residual_needs_the_same_grid(dataset):
-    other = op.ThicknessMap(np.full((17, 21), 0.4), extent=(3.0, 2.0))
-    with pytest.raises(ValueError, match="must lie on the grid"):
-        plot_residual(dataset, other)
+def test_residual_is_diverging_about_zero():
+    shades = plt.get_cmap(DIVERGING)(np.linspace(0, 1, 65))[:, :3] @ [0.299, 0.587, 0.114]
+    assert np.argmax(shades) == 32
+    assert (np.diff(shades)[:31] > 0).all()
+    assert (np.diff(shades)[33:] < 0).all()
 
 
-def test_report(dataset, loaded):
+def test_residual_of_a_map_on_other_pixels(dataset, loaded):
+    """Every fourth pixel of the map, so that the finer one has the same residual there."""
+    coarse = op.ThicknessMap(loaded.values[::4, ::4], extent=loaded.extent, mask=loaded.mask[::4, ::4])
+    shown = plot_residual(dataset, coarse).images[0].get_array()
+    fine = plot_residual(dataset, loaded).images[0].get_array()
+    np.testing.assert_allclose(shown, fine[::4, ::4], rtol=1e-9, atol=1e-9)
+
+
+def test_residual_needs_a_map(truth):
+    with pytest.raises(ValueError, match=r"no thickness map to compare with; pass measured=\."):
+        plot_residual(truth)
+
+
+@pytest.mark.parametrize("count", [1, 3, 5, 6, 8])
+@pytest.mark.parametrize("aspect", [0.4, 1.0, 7 / 4, 4.0])
+def test_a_page_holds_all_its_maps(count, aspect):
+    (rows, columns), (width, height) = page(count, (0.0, aspect, 0.0, 1.0))
+    assert 0 <= rows * columns - count < columns
+    assert width > columns * 1.5
+    assert height > rows * 1.5
+
+
+@pytest.mark.parametrize("height", [2.0, 1.0])
+def test_maps_of_a_page_align_and_fill_it(dataset, loaded, height):
+    """Also those of a layer that is not square."""
+    scaled = {name: (dataset[name].dims, dataset[name].values * height / 2.0) for name in ("y", "y_image", "y_current")}
+    narrow = dataset.assign_coords(scaled)
+    measured = op.ThicknessMap(loaded.values, extent=(2.0, height), mask=loaded.mask)
+    figure = draw_pictures(narrow, measured)["report.png"]
+    picture = render(figure)
+    maps = [ax for ax in figure.axes if ax.get_title()]
+    assert len(maps) == 6
+    places = np.array([ax.get_position().bounds for ax in maps])
+    for column, different in zip(places.T, (3, 2, 1, 1) if height == 2.0 else (2, 3, 1, 1), strict=True):
+        assert len(np.unique(column.round(6))) == different
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in maps}) == 1
+    # Half an inch of white at most above, below and beside.
+    used = np.argwhere(picture < 250)
+    assert (used.min(axis=0) < 50).all()
+    assert (picture.shape - used.max(axis=0) < 50).all()
+
+
+def test_report(dataset, loaded, solution):
     drawn = draw_pictures(dataset, loaded)
     assert list(drawn) == ["pressure.png", "report.png"]
     figure = drawn["report.png"]
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
     force = -float(dataset.force_sample[2])
-    assert titles[:3] == ["Measured thickness", f"Pressure at the sample, {force:.3g} N", "Contact at the sample"]
-    assert titles[3].endswith("µm rms")
+    rms = op.summary(solution, loaded)["residual_rms_um"]
+    assert titles == [
+        "Measured thickness",
+        "Compression",
+        f"Pressure at the sample, {force:.3g} N",
+        f"Residual, {rms:.2g} µm rms",
+        "Contact at the sample",
+        "Contact at the window",
+    ]
     picture = render(figure)
     # Not blank, and nothing touches the rim of the page.
     assert picture.std() > 20

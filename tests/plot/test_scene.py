@@ -35,6 +35,37 @@ def test_colours_span_the_pressure_in_kpa(solution, plotter):
     assert bounds.z_max - bounds.z_min < 0.55  # the mesh itself is not stretched
 
 
+def display(plotter, x: float, y: float, z: float) -> tuple[float, float]:
+    """Where a point of the layer is seen: pixels to the right and up."""
+    plotter.render()
+    plotter.renderer.SetWorldPoint(*(plotter.scale * np.array([x, y, z])), 1.0)
+    plotter.renderer.WorldToDisplay()
+    return plotter.renderer.GetDisplayPoint()[:2]
+
+
+def test_the_layer_lies_as_on_the_maps(solution, plotter):
+    op.plot_layer(solution, plotter)
+    middle, right, lower, sample = (
+        display(plotter, *point) for point in ((1.0, 1.0, 0.0), (2.0, 1.0, 0.0), (1.0, 2.0, 0.0), (1.0, 1.0, 0.5))
+    )
+    assert right[0] > middle[0] + 50
+    assert lower[1] < middle[1] - 50
+    assert sample[1] > middle[1] + 20
+
+
+def test_ticks_are_at_round_numbers(solution, plotter, monkeypatch):
+    said = []
+    monkeypatch.setattr(plotter, "add_point_labels", lambda at, labels, **_: said.append((at, labels)))
+    op.plot_layer(solution, plotter, stretch_z=2.0)
+    assert [labels for _, labels in said] == [
+        ["0", "0.5", "1", "1.5", "2", "x [mm]"],
+        ["0", "0.5", "1", "1.5", "2", "y [mm]"],
+        ["0", "0.2", "0.4", "z [mm]"],
+    ]
+    for axis, (at, labels) in enumerate(said):
+        np.testing.assert_allclose(at[:-1, axis] / [1.0, -1.0, 2.0][axis], [float(label) for label in labels[:-1]])
+
+
 def test_a_scene_off_screen_needs_no_display_and_does_not_complain(solution, monkeypatch, capfd):
     monkeypatch.delenv("DISPLAY", raising=False)
     scene = op.plot_layer(solution, off_screen=True)

@@ -57,6 +57,18 @@ def test_a_long_stage_is_not_silent(capsys, monkeypatch):
     assert set(said[1:]) == {"load 37 %, 4 Newton steps"}
 
 
+def test_a_line_is_said_once_in_the_log_of_a_long_call(capsys, monkeypatch):
+    with Progress(True, at_once=True) as shown:
+        shown.stage("sweep")
+        shown.line("1 of 2 points")
+        shown.line("2 of 2 points")
+    assert lines(capsys) == ["sweep", "1 of 2 points", "2 of 2 points"]
+    with Progress(True) as short:
+        short.stage("sweep")
+        short.line("1 of 2 points")
+    assert lines(capsys) == []
+
+
 def test_short_library_calls_are_quiet_and_long_ones_are_not(capsys, monkeypatch):
     for _ in range(3):
         with Progress(True) as shown:

@@ -14,6 +14,7 @@ from opfem.solvers import CONVERGED
 from opfem.solvers.progress import Progress
 from opfem.sweeps.outputs import GOOD
 from opfem.sweeps.progress import SweepProgress
+from opfem.sweeps.store import Outcome
 from tests.tolerances import ROUNDOFF
 
 MODES = ("map", "vmap", "call")
@@ -184,5 +185,6 @@ def test_progress_says_rate_failures_and_time_left(monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     bar = SweepProgress(Progress(False), total=100, finished=40)
     now[0] = 10.0
-    bar.show(done=20, failed=3)
+    for status in 17 * ["successful"] + 3 * ["nonfinite"]:
+        bar.finished({}, Outcome(status, "", 0.5, {}, {}))
     assert bar.text() == "2 points/s, 3 failed, 0:20 left"

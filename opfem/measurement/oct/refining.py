@@ -122,10 +122,14 @@ def refine(
     """
     widths = (_SURFACE * geometry.average[0], _SURFACE * geometry.average[1])
     found = Refined(surface, surface, surface, np.zeros(surface.shape, int), ignored)
+    # Blocks of one size, nearly: the last must not be a few rows, whose mean profile is mostly speckle.
+    ny = surface.shape[0]
+    block_rows = math.ceil(ny / math.ceil(ny / block_rows))
+    decay: Array | None = None
     for number in range(_PASSES):
         prior = jnp.asarray((geometry.dz / np.array(_PRIORS[min(number, 1)])) ** 2 / geometry.looks, jnp.float32)
         flat = smooth_surface(found.depth, widths, ignored)
-        fits, own = _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows, prior)
+        fits, own, decay = _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows, prior, decay)
         if number == 0:
             shaded = _shaded(own, ignored, geometry)
             ignored = ignored | shaded
@@ -135,8 +139,12 @@ def refine(
     return found._replace(depth=found.depth * geometry.dz, std=found.std * geometry.dz)
 
 
-def _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows, prior):
-    """Fit each model to all A-lines, block by block; maps of each number, and of the power of each A-line."""
+def _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows, prior, known_decay):
+    """Fit each model to all A-lines, block by block; maps of each number, and of the power of each A-line.
+
+    Rates of decay are those of the pass before, the mean of all blocks, so that no step runs where two blocks meet; in
+    the first pass those of the block itself.
+    """
     ny, nx = flat.shape
     spacing = np.asarray(volume.spacing)
     slope = (
@@ -152,8 +160,7 @@ def _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows
     half, reach = (round(length / geometry.dz) for length in (_HALF_WINDOW, _REACH))
     kernels = tuple(tuple(_kernel(w).astype(np.float32).tolist()) for w in geometry.average)
     halo, lag = len(kernels[0]) // 2, coupling_lag(geometry.axial)
-    block_rows = min(block_rows, ny)
-    own = np.empty((ny, nx))
+    own, decays = np.empty((ny, nx)), []
     maps = [[np.empty((ny, nx), np.float32) for _ in EdgeFit._fields] for _ in models]
     for first in range(0, ny, block_rows):
         wanted = np.arange(first, min(first + block_rows, ny))
@@ -164,14 +171,15 @@ def _fit_blocks(volume, geometry, flat, sign, ignored, models, lines, block_rows
         own[wanted] = band[halo : halo + wanted.size].mean(axis=2)
         profile, weight = _averaged(band, valid, (flat[rows] % 1.0).astype(np.float32), counts, kernels)
         inner = np.clip(np.arange(first, first + block_rows), 0, ny - 1)
-        decay = _decays(profile, weight, half, geometry.axial)
+        decays.append(_decays(profile, weight, half, geometry.axial))
+        decay = decays[-1] if known_decay is None else known_decay
         per_line = [jnp.asarray(field[inner].ravel(), jnp.float32) for field in (width, sign)]
         for fields, model in zip(maps, models, strict=True):
             fit = fit_edges(profile, weight, per_line[0], decay, per_line[1], prior, model, reach, lag)
             for field, value in zip(fields, fit, strict=True):
                 field[wanted] = np.asarray(value).reshape(block_rows, nx)[: wanted.size]
         volume.release()
-    return [EdgeFit(*fields) for fields in maps], own
+    return [EdgeFit(*fields) for fields in maps], own, jnp.mean(jnp.stack(decays), axis=0)
 
 
 def _shaded(own, ignored, geometry: Geometry) -> Bool[np.ndarray, "ny nx"]:

@@ -169,12 +169,13 @@ def test_depth_counts_from_the_zero_delay():
     np.testing.assert_allclose(part.depth, whole.depth, atol=0.1 * UM)
 
 
-@pytest.mark.slow
 def test_blocks_of_scans_change_nothing():
+    """Nor a last block of three rows, whose own mean profile is mostly speckle."""
     volume = simulated(waves(0.3))
-    one, other = (op.find_interface(volume, op.UWA_845NM, block_rows=rows) for rows in (96, 20))
-    # Decay rates are those of a block.
-    np.testing.assert_allclose(one.depth, other.depth, atol=0.3 * UM)
+    one, other = (op.find_interface(volume, op.UWA_845NM, block_rows=rows) for rows in (96, 31))
+    # Rates of decay are means over blocks, and those of a block in the first pass.
+    np.testing.assert_allclose(one.depth, other.depth, atol=0.05 * UM)
+    np.testing.assert_allclose(np.median(one.std, axis=1), np.median(other.std, axis=1), rtol=0.01)
 
 
 def test_what_cannot_be_found_is_refused():
