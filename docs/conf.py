@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 import opfem
 
@@ -24,7 +25,6 @@ extensions = [
     "cyclopts.ext.sphinx",
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
 ]
 exclude_patterns = ["_build"]
@@ -49,12 +49,15 @@ napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_custom_sections = ["Source"]
 
+html_math_renderer = "mathml"  # read by browsers without a script, so that the site opens offline
 html_theme = "pydata_sphinx_theme"
 html_title = "opfem"
 html_static_path = ["_static"]
 html_show_sourcelink = False
+html_sidebars = {page: [] for page in ("index", "start", "validation", "performance", "changes")}
 html_theme_options = {
     "show_prev_next": True,
+    "header_links_before_dropdown": 7,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
@@ -84,8 +87,8 @@ def shorten(text: str) -> str:
 
 
 def readable_types(app: object, what: str, name: str, obj: object, options: object, signature: str, returns: str):
-    """Shorten types of signatures."""
-    return tuple(text and shorten(text) for text in (signature, returns))
+    """Shorten types of signatures, and leave out those of numbers, which a converter takes in any form."""
+    return tuple(text and re.sub(r"(?<=\w): Any\b", "", shorten(text)) for text in (signature, returns))
 
 
 def first_line(app: object, what: str, name: str, obj: object, options: object, lines: list[str]):
@@ -94,11 +97,19 @@ def first_line(app: object, what: str, name: str, obj: object, options: object, 
         lines.insert(0, "")
 
 
-def readable_properties(app: object, doctree: nodes.document):
-    """Shorten types of properties, which are no signatures."""
+def readable_text(app: object, doctree: nodes.document):
+    """Shorten types of properties, which are no signatures; set a dash between an argument and what it is."""
     for text in list(doctree.findall(nodes.Text)):
-        if "jaxlib._jax." in text:
-            text.parent.replace(text, nodes.Text(shorten(text.astext())))
+        if "jaxlib._jax." in text or text == " -- ":
+            text.parent.replace(text, nodes.Text(shorten(text.astext()).replace(" -- ", " – ")))
+
+
+def write_math(translator: object, node: nodes.Element):
+    """Write a formula as MathML."""
+    block = isinstance(node, nodes.math_block)
+    formula = tex2mathml(node.astext(), as_block=block)
+    translator.body.append(f'<div style="text-align: center; margin: 1em 0">{formula}</div>' if block else formula)
+    raise nodes.SkipNode
 
 
 def plain_text(app: object, what: str, name: str, obj: object, options: object, lines: list[str]):
@@ -112,4 +123,5 @@ def setup(app):
     app.connect("autodoc-process-signature", readable_types)
     app.connect("autodoc-process-docstring", first_line, priority=400)
     app.connect("autodoc-process-docstring", plain_text, priority=600)
-    app.connect("doctree-read", readable_properties)
+    app.connect("doctree-read", readable_text)
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
