@@ -1,7 +1,7 @@
 """Stores a number that a benchmark prints as a figure of benchmarks/results/SUBJECT.json.
 
 Run `python benchmarks/coin.py MAP | python -m benchmarks.record 01-coin --key seconds --unit s --what "second solve"
---program coin.py --machine intel [--ratio KEY --peer "times as fast as ..."] [--load "other work"] [--note ...]`.
+--program coin.py --machine intel [--ratio KEY --peer "times as fast as ..."] [--load ...] [--note ...]`.
 KEY is taken from every line that has it; of several, the least and the largest are stored. A figure of the same `what`
 is replaced. Commit and date are added. `--machine` names an entry of machines.json; `--describe` adds one. Lines pass
 through. Then run `benchmarks.tables`.
