@@ -53,6 +53,7 @@ html_math_renderer = "mathml"  # read by browsers without a script, so that the 
 html_theme = "pydata_sphinx_theme"
 html_title = "opfem"
 html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 html_show_sourcelink = False
 html_sidebars = {page: [] for page in ("index", "start", "validation", "performance", "changes")}
 html_theme_options = {
