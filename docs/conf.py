@@ -58,7 +58,7 @@ html_show_sourcelink = False
 html_sidebars = {page: [] for page in ("index", "start", "validation", "performance", "changes")}
 html_theme_options = {
     "show_prev_next": True,
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 6,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
@@ -105,6 +105,13 @@ def readable_text(app: object, doctree: nodes.document):
             text.parent.replace(text, nodes.Text(shorten(text.astext()).replace(" -- ", " – ")))
 
 
+def without_empty_outputs(app: object, doctree: nodes.document, page: str):
+    """Leave out what a progress line was, which ends empty."""
+    for block in list(doctree.findall(nodes.literal_block)):
+        if "text_plain" in block["classes"] and not block.astext().strip():
+            block.parent.remove(block)
+
+
 def write_math(translator: object, node: nodes.Element):
     """Write a formula as MathML."""
     block = isinstance(node, nodes.math_block)
@@ -125,4 +132,5 @@ def setup(app):
     app.connect("autodoc-process-docstring", first_line, priority=400)
     app.connect("autodoc-process-docstring", plain_text, priority=600)
     app.connect("doctree-read", readable_text)
+    app.connect("doctree-resolved", without_empty_outputs)
     app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
