@@ -97,7 +97,7 @@ def lobes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def truth_case() -> None:
-    """No inverse crime (VALIDATION.md test 41)."""
+    """No inverse crime (docs/validation.md test 41)."""
     side, fine, coarse = 2.5, experiment((36, 36, 6), 2.5, element="tet10"), experiment((20, 20, 4), 2.5)
     known = op.solve(fine, op.Traction(lobes(*map(np.asarray, fine.mesh().plane()))))
     measured = as_map(surface(fine, known, 151), side, seed=1)
@@ -299,7 +299,7 @@ def plot_beside_imprint(fits: list[op.TractionFit], imprint: op.Solution, out: P
 
 
 def coverage_case(fits: int, first: int, believed: float) -> None:
-    """Truths drawn from the prior (VALIDATION.md test 42): is a functional in its own interval, and at what rank?
+    """Truths drawn from the prior (docs/validation.md test 42): is a functional in its own interval, and at what rank?
 
     Args:
         fits: How many truths.

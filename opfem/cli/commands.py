@@ -128,7 +128,7 @@ def fit(
 @app.command
 def sweep(
     config: Annotated[
-        Path, Parameter(name="CONFIG", help="A .toml file with [inputs], [axes] and [outputs]; the README shows one.")
+        Path, Parameter(name="CONFIG", help="A .toml file with [inputs], [axes] and [outputs]; see the documentation.")
     ],
     /,
     *,
@@ -154,7 +154,7 @@ def simulate(
         Parameter(
             name="SCENE",
             help="A .toml file with [layer], [sample], [[inclusion]], [experiment], [window], [interface], [plate], "
-            "[compression] and [measurement]; the README shows one.",
+            "[compression] and [measurement]; see the documentation.",
         ),
     ],
     /,

@@ -160,7 +160,7 @@ class ExponentialOverclosure(AbstractOverclosure):
         ValueError: If a number is not positive.
 
     Source:
-        Abaqus Theory Guide 5.2.1; values in VALIDATION.md, table E.
+        Abaqus Theory Guide 5.2.1; values in docs/validation.md, table E.
     """
 
     pressure: Array = eqx.field(converter=Leaf("ExponentialOverclosure.pressure (p0)", "MPa"))

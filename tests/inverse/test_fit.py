@@ -417,7 +417,7 @@ def test_two_constants_are_not_told_apart_at_small_strain(small):
 @pytest.mark.filterwarnings("ignore:χ²")  # of priors that are too strong
 @pytest.mark.parametrize("how", ["discrepancy", "evidence"])
 def test_chosen_prior_is_at_most_twice_as_far_from_the_truth_as_the_best(small, how):
-    """VALIDATION.md test 40, from a prior eight times too wide."""
+    """docs/validation.md test 40, from a prior eight times too wide."""
     experiment, settings, prior, known = small
     thickness = small_map(small)
 
@@ -477,7 +477,7 @@ def test_displacements_inside_tell_what_a_masked_map_does_not(small):
 
 @pytest.mark.slow
 def test_mean_pressure_under_a_bonded_nearly_incompressible_layer_is_named(small):
-    """VALIDATION.md test 40: it hardly moves the interface, and rests on the prior."""
+    """docs/validation.md test 40: it hardly moves the interface, and rests on the prior."""
     _, settings, prior, known = small
     sides = dict.fromkeys(("x0", "x1", "y0", "y1"), "roller")
     named = []

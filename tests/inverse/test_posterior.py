@@ -1,4 +1,4 @@
-"""The linear-Gaussian oracle (VALIDATION.md test 39): posterior, degrees of freedom and misfit in closed form."""
+"""The linear-Gaussian oracle (docs/validation.md test 39): posterior, degrees of freedom and misfit in closed form."""
 
 import equinox as eqx
 import jax
@@ -69,7 +69,7 @@ def test_draws_have_the_posterior_covariance(modes, posterior):
 
 
 def test_data_of_shorter_waves_fall_faster_than_the_gain_down_to_the_noise(modes):
-    """The discrete Picard condition (VALIDATION.md test 40)."""
+    """The discrete Picard condition (docs/validation.md test 40)."""
     gain, variance = modes
     truth, noise = jax.random.normal(jax.random.key(2), (2, 4000, POINTS))
     data = gain * jnp.sqrt(variance) * truth + NOISE * noise

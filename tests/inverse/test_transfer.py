@@ -1,4 +1,4 @@
-"""The layer's transfer function against its closed form's table (VALIDATION.md, table B) and its limits."""
+"""The layer's transfer function against its closed form's table (docs/validation.md, table B) and its limits."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 import opfem as op
 from opfem.inverse.transfer import poisson_ratio, transfer_function, wave_numbers
 
-# μG/h over x = k h, for Poisson's ratios 0.3, 0.45, 0.475, 0.49, 0.499, 0.5 (VALIDATION.md, table B, bonded).
+# μG/h over x = k h, for Poisson's ratios 0.3, 0.45, 0.475, 0.49, 0.499, 0.5 (docs/validation.md, table B, bonded).
 RATIOS = (0.3, 0.45, 0.475, 0.49, 0.499, 0.5)
 BONDED = {
     0.1: (0.2859153, 0.0928613, 0.0501610, 0.0225700, 0.00523796, 0.00327441),
@@ -50,7 +50,7 @@ def test_limits_and_no_jumps(base, poisson):
 
 @pytest.mark.parametrize(("poisson", "uniform", "peak"), [(0.47541, 4.04, 15.0), (0.499, 0.17, 13.8), (0.5, 0.0, 13.7)])
 def test_uniform_pressure_hardly_indents_a_bonded_incompressible_layer(poisson, uniform, peak):
-    """VALIDATION.md test 40, mm/MPa: its figures are of moduli between 5.80 and 5.87 kPa, the layer's own."""
+    """docs/validation.md test 40, mm/MPa: its figures are of moduli between 5.80 and 5.87 kPa, the layer's own."""
     shear = 2 * (2.23e-3 + 7.03e-4)
     gain = transfer_function(jnp.linspace(0.0, 20.0, 401), 0.5, shear, poisson, "bonded")
     assert gain[0] == pytest.approx(uniform, rel=0.012, abs=1e-12)

@@ -372,7 +372,7 @@ UNIT = flat(shape=(1, 1), extent=(1.0, 1.0))
 
 
 def coulomb_block(above=False, **given):
-    """Test 27 of VALIDATION.md: 1 mm² under 10 MPa, friction 0.3, sticking slope 100 N/mm."""
+    """Test 27 of docs/validation.md: 1 mm² under 10 MPa, friction 0.3, sticking slope 100 N/mm."""
     contact = op.Contact(op.LinearOverclosure(100.0), friction=0.3, **(given or {"stick_slope": 100.0}))
     return contact_face(contact, plane_surface(0.0) if above else PLANE, above)
 

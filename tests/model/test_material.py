@@ -1,4 +1,4 @@
-"""Materials against NumPy formulas, against `energy` differentiated, and against table A of VALIDATION.md."""
+"""Materials against NumPy formulas, against `energy` differentiated, and against table A of docs/validation.md."""
 
 from fractions import Fraction
 

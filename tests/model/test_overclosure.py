@@ -1,4 +1,4 @@
-"""Pressure–overclosure laws against closed forms and table E of VALIDATION.md."""
+"""Pressure–overclosure laws against closed forms and table E of docs/validation.md."""
 
 import jax
 import jax.numpy as jnp

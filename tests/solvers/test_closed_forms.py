@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 import opfem as op
 from tests.experiments import flat_map, published_palpation
 
-C10, C01, BULK = 2.2e-3, 7.03e-4, 0.11612  # MPa; VALIDATION.md, MR20
+C10, C01, BULK = 2.2e-3, 7.03e-4, 0.11612  # MPa; docs/validation.md, MR20
 MATERIAL = op.MooneyRivlin(c10=C10, c01=C01, bulk=BULK)
 WIDE = (5.0, 5.0)  # mm
 ACCURATE = op.Newton(rtol=1e-8)
@@ -33,7 +33,7 @@ SLOW = [pytest.param(element, marks=pytest.mark.slow) for element in ("full", "r
 @pytest.mark.parametrize("element", ["mean_dilatation", *SLOW])
 @pytest.mark.parametrize("sides", ["free", "roller"])
 def test_07_08_uniform_compression(sides, element):
-    """VALIDATION.md tests 7 and 8: lubricated and confined compression."""
+    """docs/validation.md tests 7 and 8: lubricated and confined compression."""
     palpation = published_palpation(0.0, 0.0, MATERIAL, extent=WIDE, sides=sides, element=element)
     for stretch in (0.9, 0.8, 0.7, 0.6, 0.5):
         solution = op.solve(palpation, op.Imprint(flat_map(0.5 * stretch, WIDE)), ACCURATE)
@@ -49,7 +49,7 @@ def test_07_08_uniform_compression(sides, element):
 
 
 def test_30_friction_bracket():
-    """VALIDATION.md test 30: the force between flat plates rises from free spreading to a bonded layer."""
+    """docs/validation.md test 30: the force between flat plates rises from free spreading to a bonded layer."""
     flat = op.Imprint(flat_map(0.45, WIDE))
     solutions = [
         op.solve(published_palpation(friction, friction, MATERIAL, extent=WIDE), flat, ACCURATE)
@@ -71,7 +71,7 @@ def test_30_friction_bracket():
 
 
 def transfer(x: float, nu: float, bonded: bool) -> float:
-    """μG/h of VALIDATION.md, table B."""
+    """μG/h of docs/validation.md, table B."""
     sinh, cosh = np.sinh(2 * x), np.cosh(2 * x)
     if bonded:
         return (1 - nu) / x * ((3 - 4 * nu) * sinh - 2 * x) / ((3 - 4 * nu) * cosh + 2 * x**2 + 5 - 12 * nu + 8 * nu**2)
@@ -86,7 +86,7 @@ def test_transfer_reproduces_table_b():
 @pytest.mark.parametrize("window", ["bonded", pytest.param("roller", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kh", [1.0, 3.0])
 def test_17_18_transfer_function(kh, window):
-    """VALIDATION.md tests 17 and 18, half a wavelength between rollers: 40 elements per wavelength, 16 deep."""
+    """docs/validation.md tests 17 and 18, half a wavelength between rollers: 40 elements per wavelength, 16 deep."""
     h, nu, shear = 0.5, 0.475, 2 * (C10 + C01)
     length = np.pi * h / kh
     bulk = 2 * shear * (1 + nu) / (3 * (1 - 2 * nu))

@@ -194,7 +194,7 @@ def test_derivatives_equal_central_differences_and_forward_equals_reverse(name):
 
 @pytest.mark.slow
 def test_taylor_remainders_fall_with_the_order_of_the_derivatives_taken_away():
-    """VALIDATION.md test 37, second derivatives included: halving the step divides remainders by 2, 4 and 8."""
+    """docs/validation.md test 37, second derivatives included: halving the step divides remainders by 2, 4 and 8."""
     solve, numbers = CASES["traction on a bonded layer"]
 
     @partial(jax.jit, compiler_options=op.compiler_options())

@@ -6,7 +6,7 @@ import pytest
 
 import opfem as op
 
-C10, C01 = 2.2e-3, 7.03e-4  # MPa; VALIDATION.md, MR20
+C10, C01 = 2.2e-3, 7.03e-4  # MPa; docs/validation.md, MR20
 SHEAR = 2 * (C10 + C01)
 L0, SIDE = 0.5, 1.0  # mm
 
@@ -23,7 +23,7 @@ def squeezed(material, stretch: float, sides="free") -> tuple[float, op.Solution
 @pytest.mark.slow
 @pytest.mark.parametrize("element", ["reduced", "hybrid", "tet4", "tet10"])
 def test_07_08_uniform_compression_to_half_the_thickness(element):
-    """VALIDATION.md, table A [MPa]; under contact in test_closed_forms."""
+    """docs/validation.md, table A [MPa]; under contact in test_closed_forms."""
     layer = op.Layer(L0, op.MooneyRivlin(C10, C01, bulk=20 * SHEAR))
     for sides, expected in (("free", 12.807315e-3), ("roller", 68.587463e-3)):
         palpation = op.Palpation(layer, (SIDE, SIDE), (4, 4, 2), op.Roller(), op.Roller(), sides=sides, element=element)

@@ -1,4 +1,4 @@
-"""Explicit dynamics: VALIDATION.md tests 28 and 32 to 36, and what users of the solver meet."""
+"""Explicit dynamics: docs/validation.md tests 28 and 32 to 36, and what users of the solver meet."""
 
 import dataclasses
 
@@ -139,7 +139,7 @@ def test_34_period_is_that_of_central_differences():
 
 
 class TestStableIncrement:
-    """35: the limits of VALIDATION.md for a cube of ν = 0.4754, in L/c."""
+    """35: the limits of docs/validation.md for a cube of ν = 0.4754, in L/c."""
 
     @staticmethod
     def unit(made: Dynamics, n: int) -> float:
