@@ -12,7 +12,7 @@ from rich.table import Table
 from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
 from ..model import Contact, MooneyRivlin, Palpation
-from ..results import area_rows, pressure_rows, summary, to_xarray
+from ..results import layer_rows, pressure_rows, summary, to_xarray
 from ..solvers import Newton
 from ..solvers.progress import Progress
 from .folder import EXAMPLE, prepare, settle, write_result
@@ -167,7 +167,7 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
         *pressure_rows(numbers),
         ("its standard deviation, mean", f"{numbers['pressure_std_mean_kPa']:.2g}", "kPa"),
         ("resolution", f"{sorted(numbers['resolution_um'])[len(numbers['resolution_um']) // 2]:.0f}", "µm"),
-        *area_rows(numbers),
+        *layer_rows(numbers),
         ("measured − computed thickness, rms", f"{numbers['residual_rms_um']:.2g}", "µm"),
         ("thickness that the mesh misses", f"{numbers['model_std_um']:.2g}", "µm"),
         ("χ² per degree of freedom", f"{numbers['reduced_chi2']:.2f}", ""),

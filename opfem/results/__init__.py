@@ -9,7 +9,7 @@ from .interior import LayerFields, layer_fields, sample_fields
 from .measured import measured_thickness
 from .oct_scene import OctScene, oct_scene
 from .pixels import on_pixels
-from .summary import area_rows, pressure_rows, summary, summary_rows
+from .summary import layer_rows, pressure_rows, summary, summary_rows
 
 __all__ = [
     "Calibration",
@@ -20,9 +20,9 @@ __all__ = [
     "OctScene",
     "Solution",
     "TractionFit",
-    "area_rows",
     "compare",
     "layer_fields",
+    "layer_rows",
     "measured_thickness",
     "oct_scene",
     "on_pixels",

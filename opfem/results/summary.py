@@ -75,8 +75,7 @@ def summary_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("force on the layer, normal", f"{0.0 - fz:.4g}", "N"),
         ("force on the layer, lateral", f"{math.hypot(fx, fy):.2g}", "N"),
         *pressure_rows(numbers),
-        ("compression, mean and largest", _pair(numbers, "compression_mean_percent", "compression_max_percent"), "%"),
-        *area_rows(numbers),
+        *layer_rows(numbers),
         *([] if residual is None else [("measured − computed thickness, rms", f"{residual:.2g}", "µm")]),
         ("largest lateral displacement", f"{numbers['max_lateral_displacement_um']:.3g}", "µm"),
         ("approach left by the contact law", f"{numbers['approach_um']:.2g}", "µm"),
@@ -96,15 +95,18 @@ def pressure_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def area_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Lay out what a summary says of contact on both faces of the layer."""
+def layer_rows(numbers: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Lay out what a summary says of the layer: its compression, and contact on both of its faces."""
     return [
-        (
-            f"open, stick, slip at the {face}",
-            ", ".join(f"{numbers[f'{prefix}{state}_area_mm2']:.3g}" for state in _STATES),
-            "mm²",
-        )
-        for face, prefix in (("sample", ""), ("window", "window_"))
+        ("compression, mean and largest", _pair(numbers, "compression_mean_percent", "compression_max_percent"), "%"),
+        *(
+            (
+                f"open, stick, slip at the {face}",
+                ", ".join(f"{numbers[f'{prefix}{state}_area_mm2']:.3g}" for state in _STATES),
+                "mm²",
+            )
+            for face, prefix in (("sample", ""), ("window", "window_"))
+        ),
     ]
 
 
