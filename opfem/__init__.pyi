@@ -1,6 +1,7 @@
 """The public names and the modules that hold them; read by `__init__.py`, type checkers and editors."""
 
 from . import datasets as datasets
+from .calibration import Calibration as Calibration, calibrate as calibrate
 from .compilation import cache_compilation as cache_compilation
 from .decks import (
     Deck as Deck,
@@ -12,7 +13,6 @@ from .decks import (
 )
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
-    Calibration as Calibration,
     FitError as FitError,
     FitStatus as FitStatus,
     ForceReading as ForceReading,
@@ -25,7 +25,6 @@ from .inverse import (
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
     TractionFit as TractionFit,
-    calibrate as calibrate,
     fit_parameters as fit_parameters,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,

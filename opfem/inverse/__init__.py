@@ -1,7 +1,5 @@
 """From measured thickness to traction: least squares through the solver, and faster estimates."""
 
-from .calibration import calibrate as calibrate
-from .calibration_result import Calibration as Calibration
 from .data import AxialDisplacement as AxialDisplacement, ForceReading as ForceReading
 from .estimates import (
     LinearEstimate as LinearEstimate,

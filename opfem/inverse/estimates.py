@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
+from ..model.homogeneous import cauchy_stress
 from ..model.plausible import check_against_layer
 from ..solvers.compiling import QuickJit
 from .conjugate_gradients import LeastSquares, least_squares
-from .homogeneous import cauchy_stress
 from .noise import noise_std
 from .observation import Nodes, Observation, observe
 from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes

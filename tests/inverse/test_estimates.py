@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.homogeneous import cauchy_stress
+from opfem.model.homogeneous import cauchy_stress
 
 MATERIAL = op.MooneyRivlin(c10=2.23e-3, c01=7.03e-4, bulk=0.11732)
 

@@ -18,14 +18,14 @@ from jaxtyping import Array, Float
 
 from ..measurement import MeasurementError
 from ..measurement.stress_strain import StressStrain
+from ..model.homogeneous import principal_stretches
 from ..model.material import AbstractMaterial, MooneyRivlin, NeoHooke, Yeoh
 from ..model.stability import stable_stretches
 from ..model.stretch_material import Hencky, Ogden
-from .calibration_result import Calibration
-from .correlated import correlated_covariance
-from .homogeneous import principal_stretches
+from .covariance import correlated_covariance
 from .law_model import LAWS, Curves, LawModel, Unknown, names_of
 from .platens import bonded_factor
+from .result import Calibration
 
 _MOST_STEPS = 1000
 _RTOL = 1e-13  # of the numbers and of the sum of squares: exact data gives the numbers to 1e-8

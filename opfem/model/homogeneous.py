@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement.stress_strain import Mode
-from ..model.deformation import kinematics
-from ..model.material import AbstractMaterial
+from .deformation import kinematics
+from .material import AbstractMaterial
 
 # Passes that find the volume ratio; each shortens the error by about shear / bulk.
 _VOLUME_STEPS = 60

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..measurement.stress_strain import Mode
+from ..model.homogeneous import nominal_stress
 from ..model.material import AbstractMaterial, MooneyRivlin, NeoHooke, Yeoh
 from ..model.stretch_material import Hencky, Ogden
-from .homogeneous import nominal_stress
 
 LAWS: dict[str, type[AbstractMaterial]] = {
     "neo_hooke": NeoHooke,

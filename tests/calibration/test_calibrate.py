@@ -9,11 +9,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import opfem as op
-from opfem.inverse.calibration_result import Calibration
-from opfem.inverse.correlated import correlated_covariance
-from opfem.inverse.homogeneous import nominal_stress
-from opfem.inverse.platens import bonded_factor
+from opfem.calibration.covariance import correlated_covariance
+from opfem.calibration.platens import bonded_factor
+from opfem.calibration.result import Calibration
 from opfem.model import stable_stretches
+from opfem.model.homogeneous import nominal_stress
 from tests.experiments import published_palpation
 
 EXACT = 1e-8
