@@ -14,6 +14,7 @@ from .decks import (
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
     FitError as FitError,
+    FitSettings as FitSettings,
     FitStatus as FitStatus,
     ForceReading as ForceReading,
     LinearEstimate as LinearEstimate,

@@ -1,7 +1,7 @@
 """Covariance of a least-squares fit whose residuals are correlated along each curve, as those of a load frame are.
 
-Residuals follow a first-order autoregression; its correlation is found by restricted maximum likelihood, which allows
-for the numbers that were fitted. On the host, in NumPy.
+Residuals follow a first-order autoregression; restricted maximum likelihood estimates its correlation, without bias
+from the fitted numbers. On the host, in NumPy.
 """
 
 import math
@@ -14,19 +14,19 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import t
 
-# Residuals below this part of the data are round-off, and say nothing of noise.
+# Residuals below this part of the data are round-off and no measure of noise.
 _ROUNDOFF = 1e-11
 _NORMAL = 1.959964  # of a normal number, 95 % within
 
 
 class Covariance(NamedTuple):
-    """What residuals say of a fit.
+    """Covariance of a fit from its residuals.
 
     Attributes:
         matrix: Covariance of the numbers; the square roots of its diagonal times 1.96 are 95 % intervals.
         correlation: Of neighbouring residuals [-].
-        effective: Number of independent residuals that say as much as all.
-        variance: Of one residual.
+        effective: Number of independent residuals of equal information.
+        variance: Variance of one residual.
         deviance: Minus twice the log-likelihood of the residuals, up to a constant.
     """
 
@@ -45,8 +45,8 @@ def correlated_covariance(
     Args:
         residuals: At the optimum.
         jacobian: Of the residuals by the numbers.
-        curves: Which rows are one curve; curves are independent.
-        scale: Size of the data, which says what is round-off.
+        curves: Rows of each curve; curves are independent.
+        scale: Size of the data, for the limit of round-off.
 
     Source:
         Patterson & Thompson, Biometrika 58 (1971) 545 (restricted likelihood). Intervals are widened from the normal
@@ -63,7 +63,7 @@ def correlated_covariance(
         return np.concatenate(parts)
 
     def restricted(rho):
-        """Compute the sum of squares that is left, and minus twice the restricted log-likelihood."""
+        """Compute the residual sum of squares, and minus twice the restricted log-likelihood."""
         qw, rw = np.linalg.qr(whitened(q, rho))
         left = whitened(residuals, rho)
         left = left - qw @ (qw.T @ left)
@@ -87,7 +87,7 @@ def correlated_covariance(
 
 
 def _correlate(x: np.ndarray, rho: float) -> np.ndarray:
-    """Multiply with the matrix of correlations rho^|i - j|."""
+    """Compute the product with the correlation matrix rho^|i - j|."""
     ahead = lfilter([1.0], [1.0, -rho], x, axis=0)
     back = lfilter([1.0], [1.0, -rho], x[::-1], axis=0)[::-1]
     return np.asarray(ahead) + np.asarray(back) - x

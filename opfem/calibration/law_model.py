@@ -1,4 +1,4 @@
-"""What a calibration compares: a law with unknown numbers, and the nominal stress it gives at measured stretches."""
+"""Model of a calibration: nominal stress of a law with unknown numbers at measured stretches."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ class LawModel(eqx.Module):
     Attributes:
         ratio: Bulk over shear modulus [-]; None: incompressible.
         law: Class of the law; static.
-        toe: What an offset is, "stress" or "strain"; static.
+        toe: Kind of offset, "stress" or "strain"; static.
     """
 
     ratio: Array | None
@@ -70,7 +70,7 @@ class LawModel(eqx.Module):
         return nominal_stress(self.material(unknown), stretch, mode, self.ratio is None)
 
     def measured(self, unknown: Unknown, curves: Curves) -> list[Array]:
-        """Compute what would be measured at every point of every curve [MPa], offsets included."""
+        """Compute the nominal stress at every point of every curve [MPa], offsets included."""
         stresses = []
         for curve, (stretch, mode) in enumerate(zip(curves.stretch, curves.modes, strict=True)):
             shift = unknown["offset"][curve] if unknown["offset"].size else jnp.zeros(())
@@ -81,7 +81,7 @@ class LawModel(eqx.Module):
         return stresses
 
     def residuals(self, unknown: Unknown, curves: Curves) -> Float[Array, " n"]:
-        """Compute computed minus measured stress [MPa], weighted, of all curves in a row."""
+        """Compute computed minus measured stress [MPa], weighted, of all curves concatenated."""
         parts = zip(self.measured(unknown, curves), curves.nominal, curves.weight, strict=True)
         return jnp.concatenate([weight * (computed - nominal) for computed, nominal, weight in parts])
 

@@ -1,4 +1,4 @@
-"""How much stiffer a cylinder is between bonded platens than between lubricated ones, at small strain."""
+"""Stiffening of a cylinder between bonded platens over lubricated ones, at small strain."""
 
 import math
 
@@ -25,7 +25,7 @@ def bonded_factor(diameter: float, height: float, bulk: float | None) -> float:
         bulk: Bulk over shear modulus [-]; None: incompressible.
 
     Raises:
-        ValueError: For a disc flatter, or more compressible, than the table holds.
+        ValueError: For a disc flatter, or more compressible, than those of the table.
     """
     slenderness = 0.25 * diameter / height
     poisson = _POISSON[-1] if bulk is None else (3.0 * bulk - 2.0) / (6.0 * bulk + 2.0)

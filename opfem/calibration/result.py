@@ -1,4 +1,4 @@
-"""What a calibration found: the law, how certain its numbers are, where it is stable, and what to do about it."""
+"""Result of a calibration: the law, the covariance of its numbers, its stable range, and advice."""
 
 from typing import Any
 
@@ -15,37 +15,36 @@ from ..measurement.stress_strain import Mode, StressStrain
 from ..model.material import AbstractMaterial
 from .law_model import Curves, LawModel, Unknown
 
-# A number is not identified beyond this relative standard deviation; curves of one specimen agree to the second.
+# A number is poorly identified above this relative standard deviation; specimens that differ by more are not one.
 _UNCERTAIN, _SAME_SPECIMEN = 0.2, 0.05
-# Difference of Young's modulus between the two readings of the stress that is worth a word.
+# Difference of Young's modulus between nominal and true stress above which advice names it.
 _READING = 0.1
-# Offset in stress, of the largest stress, that is worth a word: leaving 2 % out moves E0 by 7 %.
+# Offset over the largest stress above which advice names it: neglecting 2 % changes E0 by 7 %.
 _OFFSET = 0.01
 _SIGNIFICANT = 2.0  # standard deviations
 
 
 class Calibration(eqx.Module):
-    """A law that was fitted to stress–strain curves.
+    """A law fitted to stress–strain curves.
 
-    Standard deviations are such that 1.96 of them make a 95 % interval, correlated residuals counted in.
+    1.96 standard deviations are a 95 % interval, correlation of the residuals included.
 
     Attributes:
-        material: The law, ready to use; it remembers the stretches that it was fitted over.
+        material: The law, with the stretches that it was fitted over.
         names: Names of the unknowns; static.
         unknown: Their values: `numbers` of the law and `offset` of every curve.
-        covariance: Of the unknowns, in the order of `names`.
-        model: What was fitted.
-        curves: What it was compared with.
+        covariance: Covariance of the unknowns, in the order of `names`.
+        model: The fitted model.
+        curves: The data as the fit takes them.
         data: The measured curves.
         residuals: Computed minus measured stress of every curve [MPa], weighted.
-        autocorrelation: Of neighbouring residuals [-].
-        effective: Number of independent points that say as much as all.
+        autocorrelation: Correlation of neighbouring residuals [-].
+        effective: Number of independent points of equal information.
         aic: Akaike's criterion, to compare laws on the same curves: lower is better.
         std_residual: Standard deviation of one residual [MPa].
-        stability: Least and largest stretch of every mode that the law is stable over (Drucker), looked for from 0.3
-            to 3; static.
+        stability: Least and largest stable stretch (Drucker) of every mode, within 0.3 to 3; static.
         range: Least and largest stretch of the curves along the load [-].
-        platen_factor: What stresses were divided by for bonded platens [-].
+        platen_factor: Divisor of the stresses for bonded platens [-].
         reading: Coefficients of Mooney–Rivlin and Young's modulus [MPa] where stress counts as nominal, and where the
             same numbers count as the other kind.
     """
@@ -130,19 +129,19 @@ class Calibration(eqx.Module):
         return jax.jvp(lambda s: self.model.nominal(self.unknown, s, mode), (at,), (jnp.ones_like(at),))[1]
 
     def advice(self) -> list[str]:
-        """Say what the curves cannot tell, and what to do about it, in plain words."""
+        """Name poorly identified numbers and other limits of the calibration, with a remedy for each."""
         said = [*self._poorly_known(), *self._of_reading(), *self._of_specimens()]
         low, high = self.range
         said.append(
-            f"The curves reach stretches of {low:.3g} to {high:.3g}; a solve that leaves them says so in "
-            'stats["beyond_calibration"].'
+            f"The curves reach stretches of {low:.3g} to {high:.3g}; "
+            'stats["beyond_calibration"] reports a solve outside of them.'
         )
         for mode, (least, largest) in self.stability.items():
             if least > 0.301 or largest < 2.99:
                 said.append(f"The law is stable in {mode} tests from {least:.3g} to {largest:.3g} only (Drucker).")
         if self.platen_factor > 1.0:
             said.append(
-                f"Stresses were divided by {self.platen_factor:.3g} for bonded platens, which holds at small strain; "
+                f"Stresses were divided by {self.platen_factor:.3g} for bonded platens, valid at small strain; "
                 "lubricated platens need no such factor."
             )
         if self.model.ratio is None:
@@ -164,8 +163,8 @@ class Calibration(eqx.Module):
         listed = ", ".join(f"{name} ± {float(std[name]) / max(abs(float(numbers[name])), 1e-300):.0%}" for name in poor)
         E = f"E0 is known to ±{float(self.modulus_std / self.modulus):.1%}"
         return [
-            f"The curves do not tell these numbers apart: {listed}; {E}. A law with fewer numbers, neo_hooke, fits as "
-            "far as the curves reach."
+            f"These numbers are poorly identified: {listed}; {E}. A law with fewer numbers, such as neo_hooke, fits "
+            "over the range of the curves."
         ]
 
     def _of_reading(self) -> list[str]:

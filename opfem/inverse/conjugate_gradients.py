@@ -1,7 +1,7 @@
 """Linear least squares by preconditioned conjugate gradients, driven from the host or traced.
 
-Nothing is materialised: one iteration multiplies once with the Jacobian and once with its transpose. What iterations
-find out of the normal matrix corrects the preconditioner of the next system (BFGS on top of it).
+The method is matrix-free: one iteration takes one product with the Jacobian and one with its transpose. Secant pairs
+of the iterations improve the preconditioner of the next system by BFGS updates.
 """
 
 import functools
@@ -22,15 +22,15 @@ class LeastSquares(NamedTuple):
 
     Attributes:
         x: The solution.
-        rest: What it leaves of b.
+        residual: b - J x.
         gradient: Jᵀb.
-        relative_gradient: What is left of the right-hand side, in the preconditioner's norm.
-        iterations: How many it took.
-        secants: What was known of JᵀJ, and what these iterations found.
+        relative_gradient: Residual of the normal equations over their right-hand side, in the preconditioner's norm.
+        iterations: Number of iterations.
+        secants: Secant pairs of JᵀJ, those of these iterations included.
     """
 
     x: PyTree
-    rest: PyTree
+    residual: PyTree
     gradient: PyTree
     relative_gradient: Array
     iterations: Array
@@ -45,40 +45,40 @@ def least_squares(
     rtol: float | Array,
     most: int | Array,
     negligible: float | Array = 0.0,
-    further: Callable[[PyTree], PyTree] | None = None,
+    added: Callable[[PyTree], PyTree] | None = None,
     secants: "Secants | None" = None,
 ) -> LeastSquares:
-    """Minimise |J x - b|² / 2 - further(Jᵀb) · x by conjugate gradients on the normal equations.
+    """Minimise |J x - b|² / 2 - added(Jᵀb) · x by conjugate gradients on the normal equations (CGLS).
 
-    Driven from the host unless b is traced: each product is then a call.
+    The iteration runs on the host, one call per product, unless b is traced.
 
     Args:
-        jacobian: Multiply with J.
-        transpose: Multiply with its transpose.
-        precondition: Approximate inverse of JᵀJ, symmetric positive; only nearly linear is enough.
-        b: What J x is to match.
-        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + further(Jᵀb), in the preconditioner's norm.
-        most: Most iterations.
-        negligible: Enough is also a gradient of this norm: the length of what is left to go, measured by J.
-        further: What to add to the right-hand side Jᵀb, made from it; None: nothing.
-        secants: What is known of JᵀJ, to correct the preconditioner with; None: nothing, and nothing is learnt.
+        jacobian: Product with J.
+        transpose: Product with Jᵀ.
+        precondition: Approximate inverse of JᵀJ, symmetric positive definite; nearly linear suffices.
+        b: Right-hand side.
+        rtol: Relative tolerance of the gradient Jᵀ(b - J x) + added(Jᵀb), in the preconditioner's norm.
+        most: Limit of iterations.
+        negligible: Absolute tolerance of the same norm: the error of J x.
+        added: Computes, from Jᵀb, the term added to this right-hand side; None: none.
+        secants: Secant pairs of JᵀJ that correct the preconditioner; None: no correction, and no pair is recorded.
 
     Source:
         Björck, Numerical Methods for Least Squares Problems, algorithm 7.4.1 (CGLS), preconditioned;
-        Notay, SIAM J. Sci. Comput. 22 (2000) 1444 for a preconditioner that is not quite linear;
-        Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 for one that learns from the last system.
+        Notay, SIAM J. Sci. Comput. 22 (2000) 1444 (flexible CG for a nearly linear preconditioner);
+        Morales and Nocedal, SIAM J. Optim. 10 (2000) 1079 (BFGS preconditioning by earlier iterations).
     """
 
     def iterate(carry: tuple["_Iteration", "Secants | None"]) -> tuple["_Iteration", "Secants | None"]:
-        it, found = carry
-        it = _along(it, jacobian(it.p))
-        return turn(it, transpose(it.rest), found)
+        it, pairs = carry
+        it = _line_minimum(it, jacobian(it.p))
+        return turn(it, transpose(it.residual), pairs)
 
-    def turn(it: "_Iteration", gradient: PyTree, found: "Secants | None") -> tuple["_Iteration", "Secants | None"]:
-        if further is not None:
-            it = _with_added(it, gradient, further)
-        turned = _turned(it, gradient, precondition if found is None else Learnt(precondition, found))
-        return turned, None if found is None else _learnt(found, it, turned)
+    def turn(it: "_Iteration", gradient: PyTree, pairs: "Secants | None") -> tuple["_Iteration", "Secants | None"]:
+        if added is not None:
+            it = _with_added(it, gradient, added)
+        turned = _conjugate(it, gradient, precondition if pairs is None else QuasiNewtonInverse(precondition, pairs))
+        return turned, None if pairs is None else _recorded(pairs, it, turned)
 
     def begin(like: PyTree) -> "_Iteration":
         zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), like)
@@ -87,26 +87,26 @@ def least_squares(
         return _Iteration(zeros, b, zeros, zeros, zeros, zeros, zeros, zero, zero, jnp.zeros((), int), *limits)
 
     if is_traced(b):
-        # The first pass only finds the gradient: so each product appears, and is compiled, once.
+        # The first pass computes the gradient only, so that each product is compiled once.
         start = begin(jax.eval_shape(transpose, b)), secants
-        end, found = jax.lax.while_loop(lambda carry: _unfinished(carry[0]), iterate, start)
+        end, pairs = jax.lax.while_loop(lambda carry: _unfinished(carry[0]), iterate, start)
     else:
         gradient = transpose(b)
-        end, found = turn(begin(gradient), gradient, secants)
+        end, pairs = turn(begin(gradient), gradient, secants)
         while _unfinished(end):
-            end, found = iterate((end, found))
+            end, pairs = iterate((end, pairs))
     relative_gradient = jnp.sqrt(end.size / jnp.where(end.first > 0, end.first, 1.0))
-    return LeastSquares(end.x, end.rest, end.pulled, relative_gradient, end.count - 1, found)
+    return LeastSquares(end.x, end.residual, end.start, relative_gradient, end.count - 1, pairs)
 
 
 class _Iteration(NamedTuple):
     x: PyTree
-    rest: PyTree
-    pulled: PyTree  # Jᵀb
-    added: PyTree  # what `further` adds to it
-    before: PyTree  # the last gradient
+    residual: PyTree  # b - J x
+    start: PyTree  # Jᵀb
+    added: PyTree  # term added to Jᵀb
+    before: PyTree  # gradient of the last iteration
     p: PyTree
-    moved: PyTree  # the last step along p
+    moved: PyTree  # last step along p
     size: Array
     first: Array
     count: Array
@@ -122,29 +122,29 @@ def _unfinished(it: _Iteration) -> Array:
 
 
 @QuickJit
-def _along(it: _Iteration, q: PyTree) -> _Iteration:
-    """Go along p, whose product with J is q, as far as residuals fall."""
+def _line_minimum(it: _Iteration, q: PyTree) -> _Iteration:
+    """Step to the minimum along p, with q = J p."""
     squared = dot(q, q)
     step = jnp.where(squared > 0, it.size / jnp.where(squared > 0, squared, 1.0), 0.0)
     moved = jax.tree.map(lambda v: step * v, it.p)
-    return it._replace(x=plus(it.x, moved), rest=plus(it.rest, q, -step), moved=moved)
+    return it._replace(x=plus(it.x, moved), residual=plus(it.residual, q, -step), moved=moved)
 
 
 @QuickJit
-def _with_added(it: _Iteration, gradient: PyTree, further: Callable) -> _Iteration:
-    """Find in the first pass what is to be added to the right-hand side."""
-    return it._replace(added=jax.lax.cond(it.count == 0, lambda: further(gradient), lambda: it.added))
+def _with_added(it: _Iteration, gradient: PyTree, added: Callable) -> _Iteration:
+    """Compute in the first pass the term added to the right-hand side."""
+    return it._replace(added=jax.lax.cond(it.count == 0, lambda: added(gradient), lambda: it.added))
 
 
 @QuickJit
-def _turned(it: _Iteration, gradient: PyTree, precondition: Callable) -> _Iteration:
-    """Find the next direction."""
+def _conjugate(it: _Iteration, gradient: PyTree, precondition: Callable) -> _Iteration:
+    """Compute the next conjugate direction (Polak–Ribière form, for a nearly linear preconditioner)."""
     now = plus(gradient, it.added)
     z = precondition(now)
     new = dot(now, z)
     change = new - dot(it.before, z)
     return it._replace(
-        pulled=jax.tree.map(lambda new, old: jnp.where(it.count == 0, new, old), gradient, it.pulled),
+        start=jax.tree.map(lambda new, old: jnp.where(it.count == 0, new, old), gradient, it.start),
         before=now,
         p=plus(z, it.p, jnp.where(it.size > 0, change / jnp.where(it.size > 0, it.size, 1.0), 0.0)),
         size=new,
@@ -154,13 +154,13 @@ def _turned(it: _Iteration, gradient: PyTree, precondition: Callable) -> _Iterat
 
 
 @QuickJit
-def _learnt(found: "Secants", it: _Iteration, turned: _Iteration) -> "Secants":
-    """Learn of JᵀJ from the last step; in the first pass there was none."""
-    return found.followed_by(it.moved, plus(it.before, turned.before, -1.0))
+def _recorded(pairs: "Secants", it: _Iteration, turned: _Iteration) -> "Secants":
+    """Record the secant pair of the last step; the first pass has none."""
+    return pairs.appended(it.moved, plus(it.before, turned.before, -1.0))
 
 
 def dot(a: PyTree, b: PyTree) -> Array:
-    """Sum the products of all numbers."""
+    """Compute the inner product."""
     products = (jnp.vdot(v, w) for v, w in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
     return functools.reduce(operator.add, products)
 
@@ -171,28 +171,28 @@ def plus(a: PyTree, b: PyTree, factor: Array | float = 1.0) -> PyTree:
 
 
 class Secants(NamedTuple):
-    """Steps taken and what they changed the gradient by, newest last; zero where there is none yet."""
+    """BFGS pairs: steps and the changes of the gradient along them, newest last; unused pairs are zero."""
 
     step: PyTree
     change: PyTree
 
     @classmethod
     def none(cls, like: PyTree, memory: int) -> "Secants":
-        """Remember nothing yet."""
+        """Make a memory without pairs."""
         zeros = jax.tree.map(lambda v: jnp.zeros((memory, *v.shape), v.dtype), like)
         return cls(zeros, zeros)
 
-    def followed_by(self, step: PyTree, change: PyTree) -> "Secants":
-        """Remember one more, if the gradient rose along it, and forget the oldest."""
-        rises = dot(step, change) > 0
+    def appended(self, step: PyTree, change: PyTree) -> "Secants":
+        """Append a pair of positive curvature and drop the oldest one; other pairs are skipped."""
+        positive = dot(step, change) > 0
 
         def append(stack, new):
-            return jnp.where(rises, jnp.concatenate([stack[1:], new[None]]), stack)
+            return jnp.where(positive, jnp.concatenate([stack[1:], new[None]]), stack)
 
         return Secants(*(jax.tree.map(append, *pair) for pair in zip(self, (step, change), strict=True)))
 
     def before(self, gradient: PyTree) -> tuple[PyTree, Array]:
-        """Turn a gradient into the right-hand side for the matrix that secants correct; also return what `after` needs.
+        """Run the first loop of the two-loop recursion: right-hand side for the uncorrected matrix, and coefficients.
 
         Source:
             Nocedal and Wright, Numerical Optimization, algorithm 7.4 (two-loop recursion).
@@ -205,7 +205,7 @@ class Secants(NamedTuple):
         return jax.lax.scan(one, gradient, self, reverse=True)
 
     def after(self, x: PyTree, along: Array) -> PyTree:
-        """Turn the solution with that matrix into the direction."""
+        """Run the second loop: from the solution with the uncorrected matrix to the direction."""
 
         def one(x, each):
             secant, along = each
@@ -214,21 +214,21 @@ class Secants(NamedTuple):
         return jax.lax.scan(one, x, (self, along))[0]
 
     def corrected(self, inverse: Callable[[PyTree], PyTree], gradient: PyTree) -> PyTree:
-        """Multiply with an approximate inverse, corrected by what the steps changed."""
-        rest, along = self.before(gradient)
-        return self.after(inverse(rest), along)
+        """Compute the product with the BFGS update of an approximate inverse."""
+        right, along = self.before(gradient)
+        return self.after(inverse(right), along)
 
     def _weight(self) -> Array:
         curvature = dot(self.step, self.change)
         return jnp.where(curvature > 0, 1.0 / jnp.where(curvature > 0, curvature, 1.0), 0.0)
 
 
-class Learnt(eqx.Module):
-    """An approximate inverse, corrected by what iterations have found of the matrix."""
+class QuasiNewtonInverse(eqx.Module):
+    """BFGS update of an approximate inverse by secant pairs of the matrix."""
 
     inverse: Callable[[PyTree], PyTree]
     secants: Secants
 
     def __call__(self, gradient: PyTree) -> PyTree:
-        """Multiply with it."""
+        """Compute its product with a gradient."""
         return self.secants.corrected(self.inverse, gradient)

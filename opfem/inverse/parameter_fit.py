@@ -1,7 +1,7 @@
-"""`fit_parameters`: friction, moduli and offsets from what is observed of plates or imprints pressed into the layer.
+"""`fit_parameters`: friction, moduli and offsets from observations of plates or imprints pressed into the layer.
 
-States are solved one after the other, each from the one before; a few white numbers are fitted by optimistix's
-Levenberg–Marquardt method, run step by step on the host so that all states share the solver's compiled programs.
+States are solved in sequence, each from the previous one. optimistix's Levenberg–Marquardt method fits a few white
+numbers; its steps run on the host, so that all states share the solver's compiled programs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,37 +21,37 @@ from ..model import Load, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.solution import is_failure
 from ..solvers.solve import require_float64
-from .data import ForceReading
+from .observations import ForceReading, SideBulge
 from .parameters import AbstractNumberPrior, Normal, check_parameters, with_numbers
 from .result import FitError
-from .state_observations import SideBulge, residual, source_of
+from .state_residuals import residual, source_of
 
 SCALE = "scale"
-"""Name of the common factor of all increments: wavelength over index, relative to what they were scaled with."""
+"""Name of the common factor of all increments: wavelength over refractive index, relative to the assumed ratio."""
 
 _STICK = 1  # status of a contact point
-_INSENSITIVE = 1e-3  # column of the Jacobian over the largest, below which the data say nothing of a number
-_PRIOR_DOMINATED = 0.7  # of the prior's standard deviation that is left after the fit
-_CORRELATED = 0.95
-_CHI2 = 2.0  # per degree of freedom
-_STILL = 1e-10  # mm: two states that differ by less are one
+_INSENSITIVE = 1e-3  # norm of a Jacobian column over the largest one, below which the data do not depend on a number
+_PRIOR_DOMINATED = 0.7  # posterior over prior standard deviation: the data halve the variance below it
+_CORRELATED = 0.95  # correlation above which two numbers are identified only in combination
+_CHI2 = 2.0  # per datum, above which the model does not explain a source
+_IDENTICAL = 1e-10  # mm: states that differ by less are identical, to solver tolerance
 
 Experiment = Callable[[dict[str, Array]], tuple[Solution, ...]] | tuple[Palpation, Sequence[Load]]
 
 
 class ParameterFit(eqx.Module):
-    """Numbers of an experiment that explain what was observed.
+    """Numbers of an experiment fitted to observations.
 
     Attributes:
-        names: Of the fitted numbers; static.
+        names: Names of the fitted numbers; static.
         numbers: Their values, by name.
-        covariance: Of the numbers, in the order of `names`.
-        prior_share: Standard deviation after the fit over that of the prior, in its own scale, by name [-].
-        insensitive: Names of numbers that the observations say nothing of; static.
-        residuals: Standardised, by source: "phase", "force", "thickness", "bulge" [-].
+        covariance: Posterior covariance of the numbers, in the order of `names`.
+        prior_share: Posterior over prior standard deviation of the white number, by name [-].
+        insensitive: Names of numbers that the observations do not depend on; static.
+        residuals: Standardised residuals by source: "phase", "force", "thickness", "bulge" [-].
         solutions: The states at the optimum.
-        converged: Whether the fit settled; static.
-        steps: How many steps it took; static.
+        converged: Whether the fit converged; static.
+        steps: Number of steps; static.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -81,19 +81,19 @@ class ParameterFit(eqx.Module):
         return {name: jnp.sum(values**2) for name, values in self.residuals.items()}
 
     def advice(self) -> list[str]:
-        """Say what the observations cannot tell, and what does not fit, in plain words."""
+        """Name poorly identified numbers and sources that the model does not explain."""
         said = []
         for name in self.names:
             if name != SCALE and (name in self.insensitive or float(self.prior_share[name]) > _PRIOR_DOMINATED):
-                said.append(f"{name} is what its prior says: the observations tell nothing of it.")
+                said.append(f"{name} is prior-dominated: the observations do not identify it.")
         correlation = np.asarray(self.correlation)
         for a in range(len(self.names)):
             for b in range(a):
                 if abs(correlation[a, b]) > _CORRELATED:
                     said.append(
-                        f"{self.names[b]} and {self.names[a]} are told together only (correlation "
-                        f"{correlation[a, b]:+.2f}); mid-depth data alone cannot tell the sum of two frictions: "
-                        "observe all depths, or the force."
+                        f"{self.names[b]} and {self.names[a]} are identified only in combination (correlation "
+                        f"{correlation[a, b]:+.2f}). Mid-depth data do not separate two frictions: observe all depths, "
+                        "or the force."
                     )
         for name, values in self.residuals.items():
             free = max(values.size - len(self.names), 1)
@@ -122,25 +122,25 @@ def fit_parameters(
     max_steps: int = 30,
     throw: bool = True,
 ) -> ParameterFit:
-    """Fit numbers of an experiment to observations of the states that it goes through.
+    """Fit numbers of an experiment to observations of its loaded states.
 
     Args:
-        experiment: `(palpation, loads)`, the loads applied one after the other; or a function of the numbers by name
-            that returns the solved states.
-        observations: `AxialIncrement`s, which know their states; and pairs `(state, observation)` of a `ThicknessMap`,
-            a `ForceReading` or a `SideBulge` with the number of its state, from 0.
-        parameters: What is known of each number before, by its path, such as "window.friction",
-            "layer.material.bulk", "l0_offset"; or by whatever name the function takes.
-        scale: What is known of the factor of increments, fitted as "scale" where there are any.
-        model_std: Standard deviation of the increments that the mesh itself computes [mm].
-        solver: Settings of the solves; a looser `rtol` moves increments by as much as the phase tells.
-        rtol: Change of the white numbers, of a standard deviation, and of χ², at which the fit has settled.
-        max_steps: Most steps.
-        throw: Whether to raise where the fit does not settle.
+        experiment: `(palpation, loads)`, the loads applied in sequence; or a function that returns the solved states
+            from the numbers by name.
+        observations: `AxialIncrement`s, which include their states; and pairs `(state, observation)` of a
+            `ThicknessMap`, a `ForceReading` or a `SideBulge` with the number of its state, from 0.
+        parameters: Prior of each number, by its path, such as "window.friction", "layer.material.bulk", "l0_offset";
+            or by the names that the function expects.
+        scale: Prior of the factor of increments, fitted as "scale" where there are any.
+        model_std: Standard deviation of computed increments due to the mesh [mm].
+        solver: Settings of the solves; a looser `rtol` changes increments by as much as the phase resolves.
+        rtol: Change of the white numbers, and relative change of χ², at which the fit has converged.
+        max_steps: Limit of steps.
+        throw: Whether to raise where the fit does not converge.
 
     Raises:
-        ValueError: For observations or parameters that mean nothing.
-        FitError: If the first state cannot be solved, or the fit does not settle and `throw`.
+        ValueError: For invalid observations or parameters.
+        FitError: If a state cannot be solved at the priors' medians, or the fit does not converge and `throw`.
     """
     pairs = _pairs(observations)
     if not callable(experiment):
@@ -171,8 +171,8 @@ def fit_parameters(
     white, steps, converged = _least_squares(residuals, white, data, rtol, max_steps)
     if throw and not converged:
         raise FitError(
-            f"fit_parameters took max_steps={max_steps} steps without settling. Raise it, or give parameters priors "
-            "nearer to what is true."
+            f"fit_parameters did not converge within max_steps={max_steps} steps. Raise the limit, or centre the "
+            "priors closer to the true values."
         )
     _, along = jax.linearize(lambda w: residuals(w)[0], white)
     J = jax.vmap(along)(jnp.eye(len(names))).T
@@ -192,12 +192,12 @@ def _pairs(observations: Sequence[Any]) -> list[tuple[int, Any]]:
             )
         if not is_increment and not isinstance(one, tuple):
             raise ValueError(
-                f"fit_parameters: say which state the {type(observed).__name__} is of, as (0, {type(observed).__name__}"
-                "(...)) for the first."
+                f"fit_parameters: state the number of the observed state, as (0, {type(observed).__name__}(...)) for "
+                "the first."
             )
         pairs.append((state, observed))
     if not pairs:
-        raise ValueError("fit_parameters.observations must hold an observation, got none.")
+        raise ValueError("fit_parameters.observations must contain an observation, got none.")
     return pairs
 
 
@@ -228,14 +228,14 @@ def _check_first(pairs: list[tuple[int, Any]], states: tuple[Solution, ...]) -> 
             )
         if isinstance(observed, AxialIncrement):
             before, after = (states[one].displacement for one in wanted)
-            if float(jnp.max(jnp.abs(after - before))) < _STILL:
+            if float(jnp.max(jnp.abs(after - before))) < _IDENTICAL:
                 raise ValueError(
                     f"fit_parameters: states {wanted[0]} and {wanted[1]} are identical; increments need two."
                 )
 
 
 def _least_squares(residuals: Any, white: Array, data: int, rtol: float, max_steps: int) -> tuple[Array, int, bool]:
-    """Run Levenberg–Marquardt step by step, untraced: a traced loop would compile all states' solves as one program."""
+    """Run Levenberg–Marquardt on the host: a traced loop would compile the solves of all states as one program."""
     method = optx.LevenbergMarquardt(rtol=rtol, atol=rtol)
     shape = jax.ShapeDtypeStruct((data + white.size,), white.dtype)
     state = method.init(residuals, white, None, {}, shape, None, frozenset())
@@ -244,7 +244,7 @@ def _least_squares(residuals: Any, white: Array, data: int, rtol: float, max_ste
         done, _ = method.terminate(residuals, white, None, {}, state, frozenset())
         if bool(done):
             return white, step + 1, True
-        make_room()  # every step loads its linearised solves again
+        make_room()  # every step loads its linearised solves anew
     return white, max_steps, False
 
 

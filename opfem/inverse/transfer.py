@@ -1,7 +1,7 @@
-"""What pressure of one wavelength does to a layer at small strain: its transfer function.
+"""Transfer function of a layer at small strain: indentation per pressure of one wave number.
 
-u_z(h) = -G(k) p cos(k x) for a pressure p cos(k x) on a layer of thickness h. The starting point of the traction fit,
-its preconditioner, and by itself the fastest estimate.
+u_z(h) = -G(k) p cos(k x) for a pressure p cos(k x) on a layer of thickness h. It gives the linear estimate, and from it
+the preconditioner and the warm start of a fit.
 """
 
 from typing import Literal
@@ -13,9 +13,9 @@ from .._types import ScalarLike
 from ..model.material import AbstractMaterial
 
 Base = Literal["bonded", "slip"]
-# Beyond this k h, hyperbolic functions are exponentials and the layer is as good as infinitely deep.
+# Beyond this k h the layer is a half-space to round-off; hyperbolic functions would overflow.
 _DEEP = 300.0
-# Below this k h, numerator and denominator lose digits; G differs from its limit by less than 1e-8 there.
+# Below this k h numerator and denominator cancel; G differs from its limit by less than 1e-8.
 _SHALLOW = 1e-4
 
 
@@ -36,16 +36,16 @@ def transfer_function(
 
     Args:
         k: Wave numbers [1/mm].
-        thickness: Of the layer [mm].
+        thickness: Thickness of the layer [mm].
         shear: Shear modulus [MPa].
         poisson: Poisson's ratio [-], 1/2 included.
-        base: What holds the other side: "bonded", or "slip" without friction.
+        base: Boundary condition of the other face: "bonded", or "slip" without friction.
 
     Source:
         Plane-strain elasticity of a layer; for the bonded one Johnson, Contact Mechanics, section 5.8.
     """
     x = jnp.clip(k * thickness, _SHALLOW, _DEEP)
-    # Hyperbolic functions over exp(2 x).
+    # Hyperbolic functions divided by exp(2 x).
     decay = jnp.exp(-4.0 * x)
     sinh, cosh, one = 0.5 * (1.0 - decay), 0.5 * (1.0 + decay), jnp.exp(-2.0 * x)
     if base == "bonded":

@@ -8,7 +8,7 @@ from ..measurement.stress_strain import Mode
 from .deformation import kinematics
 from .material import AbstractMaterial
 
-# Passes that find the volume ratio; each shortens the error by about shear / bulk.
+# Fixed-point iterations for the volume ratio; each reduces the error by about shear / bulk.
 _VOLUME_STEPS = 60
 # Which principal direction is free of stress, and which is loaded.
 _FREE, _LOADED = 0, 2

@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from opfem.inverse.conjugate_gradients import Learnt, Secants, least_squares
+from opfem.inverse.conjugate_gradients import QuasiNewtonInverse, Secants, least_squares
 from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
 
 
@@ -46,7 +46,7 @@ def test_a_secant_that_makes_a_direction_promise_too_much_is_forgotten():
     )
     start = descent.init(y, None)
     step, change = jnp.array([1.0, 0.0]), jnp.array([0.01, 1.0])
-    learnt = start.secants.followed_by(step, change)
+    learnt = start.secants.appended(step, change)
     with_secant = learnt.after(learnt.before(residual)[0], learnt.before(residual)[1])
     assert residual @ with_secant > 100.0 * (residual @ residual)
     came = eqx.tree_at(lambda s: (s.point, s.gradient), start, (y - step, residual - change))
@@ -71,7 +71,7 @@ def test_iterations_precondition_the_next_system():
     solved = solve(first, Secants.none(first, 60))
     assert solved.iterations == solve(first).iterations
     assert solve(second, solved.secants).iterations < 0.4 * solve(second).iterations  # 2 of 11
-    learnt = Learnt(plain, solved.secants)
+    learnt = QuasiNewtonInverse(plain, solved.secants)
     for i in range(10):
         assert jnp.vdot(Q[:, i], learnt(Q[:, i])) == pytest.approx(float(size[i]) ** -2, rel=1e-3)
     assert jnp.vdot(first, learnt(second)) == pytest.approx(float(jnp.vdot(second, learnt(first))), rel=1e-9)

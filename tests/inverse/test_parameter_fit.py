@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.state_observations import axial_increment, bulge
+from opfem.inverse.state_residuals import axial_increment, bulge
 from tests.experiments import SIDE
 from tests.tolerances import ROUNDOFF
 
@@ -89,7 +89,7 @@ def test_scale_is_fitted_with_its_prior(linear):
     found = op.fit_parameters(experiment, [observed], PRIORS)
     assert float(found.std["scale"]) == pytest.approx(0.01, rel=0.01)
     assert float(found.std["thinning"] / found.numbers["thinning"]) == pytest.approx(0.01, rel=0.02)
-    assert any("told together only" in said for said in found.advice())
+    assert any("identified only in combination" in said for said in found.advice())
     assert not any("scale is what" in said for said in found.advice())
 
 
@@ -98,7 +98,7 @@ def test_a_number_that_nothing_depends_on_is_its_prior(linear):
     found = op.fit_parameters(experiment, [observed], {**PRIORS, "idle": op.LogNormal(0.1, 0.5)})
     assert found.insensitive == ("idle",)
     assert float(found.prior_share["idle"]) == pytest.approx(1.0)
-    assert any(said.startswith("idle is what its prior says") for said in found.advice())
+    assert any(said.startswith("idle is prior-dominated") for said in found.advice())
 
 
 def test_a_wrong_model_shows_in_chi2(linear):
@@ -136,7 +136,7 @@ def test_what_is_refused(linear, solution):
     experiment, observed, _ = linear
     for wrong, message in (
         ([], "must hold an observation"),
-        ([op.ForceReading(1.0, 0.1)], "say which state"),
+        ([op.ForceReading(1.0, 0.1)], "number of the observed state"),
         ([3], "must be AxialIncrement"),
         ([(2, op.ForceReading(1.0, 0.1))], "is of state 2; there are 2"),
     ):
@@ -146,7 +146,7 @@ def test_what_is_refused(linear, solution):
         op.fit_parameters(lambda numbers: (solution, solution), [observed], PRIORS)
     with pytest.raises(ValueError, match="got 1 twice"):
         op.AxialIncrement(POINTS, np.zeros(len(POINTS)), 1e-6, before=1, after=1)
-    with pytest.raises(op.FitError, match="without settling"):
+    with pytest.raises(op.FitError, match="did not converge within"):
         op.fit_parameters(experiment, [observed], PRIORS, max_steps=1)
     with pytest.raises(ValueError, match="two lists of one length"):
         op.SideBulge("x0", [0.1, 0.2], [0.0], 1e-3)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.noise import noise_std
-from opfem.inverse.observation import interface_heights, observe
+from opfem.inverse.measured_surface import interface_heights, noise_std, project_map
 
 FIELD = (5.0, 4.0)
 
@@ -38,7 +37,7 @@ def test_a_cubic_surface_is_taken_over_exactly(mesh):
     x, y = pixels()
     x_node, y_node = mesh.plane()
     cubic = lambda x, y: 0.4 + 1e-3 * (x**3 - 2 * x**2 * y + 0.5 * y**3)  # noqa: E731
-    seen = observe(mesh, measured(cubic(x, y)), 2e-3)
+    seen = project_map(mesh, measured(cubic(x, y)), 2e-3)
     # But for the splines' own slight stiffness, 1e-6 of the pixels'.
     assert seen.surface == pytest.approx(np.asarray(cubic(x_node, y_node)), abs=1e-7)
     assert seen.representation_rms < 1e-8
@@ -50,7 +49,7 @@ def test_masked_pixels_count_for_nothing(mesh):
     mask = np.random.default_rng(0).random(x.shape) < 0.3
     clean = surface(x, y)
     spoilt = np.where(mask, 0.1, clean)
-    a, b = (observe(mesh, measured(v, mask=mask), 2e-3) for v in (clean, spoilt))
+    a, b = (project_map(mesh, measured(v, mask=mask), 2e-3) for v in (clean, spoilt))
     assert a.surface == pytest.approx(b.surface, abs=0)
     assert jnp.all(b.representation == jnp.where(mask, 0.0, b.representation))
     assert a.misfit(a.surface + 1e-3)[3, 5] == (0.0 if mask[3, 5] else pytest.approx(0.5))
@@ -59,12 +58,12 @@ def test_masked_pixels_count_for_nothing(mesh):
 def test_a_masked_block_and_a_map_that_ends_early_leave_nodes_without_data(mesh):
     x, y = pixels()
     mask = (x > 1.0) & (x < 3.0) & (y > 1.0) & (y < 3.0)
-    seen = observe(mesh, measured(surface(x, y), mask=mask), 2e-3)
+    seen = project_map(mesh, measured(surface(x, y), mask=mask), 2e-3)
     inside = 7 * 7  # nodes strictly within; splines of those next to the rim reach out
     assert seen.surface.size - inside <= seen.informed < seen.surface.size
     small = op.ThicknessMap(surface(x, y), extent=(2.5, 4.0), std=2e-3)
     # 11 of 21 columns of nodes lie on it; splines of two more reach it.
-    assert 11 * 17 <= observe(mesh, small, 2e-3).informed <= 13 * 17
+    assert 11 * 17 <= project_map(mesh, small, 2e-3).informed <= 13 * 17
 
 
 def test_misfit_of_pure_noise_is_one_per_coefficient(mesh):
@@ -74,7 +73,8 @@ def test_misfit_of_pure_noise_is_one_per_coefficient(mesh):
     totals = [
         float(
             jnp.sum(
-                observe(mesh, measured(surface(x, y) + 2e-3 * rng.standard_normal(x.shape)), 2e-3).misfit(truth) ** 2
+                project_map(mesh, measured(surface(x, y) + 2e-3 * rng.standard_normal(x.shape)), 2e-3).misfit(truth)
+                ** 2
             )
         )
         for _ in range(20)
@@ -92,7 +92,7 @@ def test_noise_that_is_correlated_counts_for_less(mesh):
     for _ in range(20):
         white = measured(surface(x, y) + 2e-3 * rng.standard_normal(x.shape))
         smooth = white.smoothed(fwhm=0.1)
-        totals.append(float(jnp.sum(observe(mesh, smooth, smooth.std).misfit(truth) ** 2)))
+        totals.append(float(jnp.sum(project_map(mesh, smooth, smooth.std).misfit(truth) ** 2)))
     # Smoothing also takes some of the waves near the mesh's own: below one per coefficient, never above.
     assert 0.75 * truth.size < np.mean(totals) < 1.02 * truth.size
 
@@ -103,7 +103,7 @@ def test_error_of_the_model_counts_once_per_element(mesh):
     rng = np.random.default_rng(3)
     for shape in ((161, 201), (81, 101)):
         x, y = pixels(shape)
-        seen = observe(mesh, measured(surface(x, y)), 1e-5, model_std=1e-3)
+        seen = project_map(mesh, measured(surface(x, y)), 1e-5, model_std=1e-3)
         totals = [float(jnp.sum(seen.misfit(truth + 1e-3 * rng.standard_normal(truth.shape)) ** 2)) for _ in range(20)]
         # Splines between nodes hold less power than their values at them.
         assert 0.5 * truth.size < np.mean(totals) < truth.size

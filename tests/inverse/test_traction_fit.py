@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import opfem as op
-import opfem.inverse.fit
-from opfem.inverse.bed import lay_bed, no_bed
-from opfem.inverse.forward import Linearised, of_load, press
+from opfem.inverse.elastic_foundation import foundation_at_imprint, zero_foundation
+from opfem.inverse.forward import Linearised, forward_solve, load_mask
 from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
 from opfem.inverse.inputs import stacked
-from opfem.inverse.misfit import Misfit
-from opfem.inverse.observation import _spline_values, interface_heights, observe
-from opfem.inverse.start import on_mesh
+from opfem.inverse.measured_surface import _spline_values, interface_heights, project_map
+from opfem.inverse.objective import Objective
+from opfem.inverse.traction_fit import _status
+from opfem.inverse.warm_start import interpolated
 from opfem.mechanics.face import tributary_area
 from opfem.solvers.derivative import Handed, follow_path
 from opfem.solvers.discretise import discretise
@@ -100,10 +100,10 @@ def test_start_comes_from_any_mesh():
         x = np.linspace(0.0, 1.0, nodes)
         return np.cos(np.pi * x)[:, None] * (2.0 + np.cos(np.pi * x))
 
-    np.testing.assert_allclose(on_mesh(field(13), 1, 13, 13)[0], field(13), atol=1e-12)
-    np.testing.assert_allclose(on_mesh(field(7), 1, 13, 13)[0], field(13), atol=2e-3)
+    np.testing.assert_allclose(interpolated(field(13), 1, 13, 13)[0], field(13), atol=1e-12)
+    np.testing.assert_allclose(interpolated(field(7), 1, 13, 13)[0], field(13), atol=2e-3)
     with pytest.raises(ValueError, match=r"fit_traction.start \[MPa\].*such as \(13, 13\); got shape \(2, 7, 7\)"):
-        on_mesh(np.zeros((2, 7, 7)), 1, 13, 13)
+        interpolated(np.zeros((2, 7, 7)), 1, 13, 13)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_fit_knows_how_well_it_did(fit, truth):
     assert fit.stats["representation_rms"] == pytest.approx(NOISE, rel=0.05)
     # The residual is that of the traction which is returned.
     heights = interface_heights(palpation().mesh(), fit.solution.displacement[:, -1])
-    np.testing.assert_allclose(fit.residual, heights - fit.misfit.observations.surface[0], atol=0.01 * NOISE)
+    np.testing.assert_allclose(fit.residual, heights - fit.objective.surfaces.surface[0], atol=0.01 * NOISE)
 
 
 @pytest.mark.slow
@@ -152,12 +152,12 @@ def dead_load(field):
     return op.Traction(3e-3 + 1e-3 * field)
 
 
-def on_springs(field):
+def on_foundation(field):
     return op.Traction(0.02 + 1e-3 * field, stiffness=0.3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("load", [dead_load, on_springs])
+@pytest.mark.parametrize("load", [dead_load, on_foundation])
 def test_jacobian_of_the_fit_against_exact_derivatives(load):
     """Kept tangents give products to 1e-3 of those through `follow_path`, forward and transposed."""
     experiment, settings = palpation((6, 6, 2)), op.Newton(max_path=12).as_leaves()
@@ -172,22 +172,22 @@ def test_jacobian_of_the_fit_against_exact_derivatives(load):
         )
         return follow_path(problem, problem.initial_state(), end.path, end.kept, settings)[1].u[:, -1]
 
-    way = press(experiment, load(field), settings)
-    line = Linearised.along(way, settings)
+    path = forward_solve(experiment, load(field), settings)
+    line = Linearised.along(path, settings)
 
     def problem(field):
         laid = discretise(experiment, load(field), None, settings.face_rule)
-        return eqx.filter(laid, of_load(laid))
+        return eqx.filter(laid, load_mask(laid))
 
     solution = op.solve(experiment, load(field), settings)
-    assert jnp.all(way.end.state.u == solution.displacement)
+    assert jnp.all(path.end.state.u == solution.displacement)
     u, expected = jax.jit(lambda p: jax.jvp(exact, (p,), (change,)))(field)
-    start = Handed(way.problem.initial_state().unknowns, way.problem.initial_state().histories)
+    start = Handed(path.problem.initial_state().unknowns, path.problem.initial_state().histories)
     still = jax.tree.map(jnp.zeros_like, start)
     slope = line.push(jax.jvp(problem, (field,), (change,))[1], still)[:, -1]
     assert jnp.linalg.norm(slope - expected) < 3e-3 * jnp.linalg.norm(expected)
     weights = jax.random.normal(jax.random.key(2), u.shape)
-    pulled = jax.vjp(problem, field)[1](line.pull(jnp.zeros_like(way.end.state.u).at[:, -1].set(weights)))[0]
+    pulled = jax.vjp(problem, field)[1](line.pull(jnp.zeros_like(path.end.state.u).at[:, -1].set(weights)))[0]
     reference = jax.jit(lambda p: jax.vjp(exact, p)[1](weights)[0])(field)
     assert jnp.linalg.norm(pulled - reference) < 3e-3 * jnp.linalg.norm(reference)
 
@@ -243,7 +243,7 @@ def small():
 
 def small_map(small, seed=0, load=1.0, mask=None):
     experiment, settings, _, known = small
-    # Springs without stiffness: the fit's own program solves it.
+    # A foundation without stiffness: the program of the fit solves it.
     u = op.solve(experiment, op.Traction(load * known, stiffness=0.0), settings).displacement[:, -1]
     basis, _ = _spline_values(jnp.linspace(0.0, 6.0, 31), 6)
     heights = basis @ interface_heights(experiment.mesh(), u) @ basis.T
@@ -298,46 +298,45 @@ def test_derivative_of_the_fitted_traction_through_the_optimum(small):
         assert slope == pytest.approx(float(ahead - behind) / (2.0 * h), rel=2e-4)
 
 
-def test_springs_where_a_corner_was_not_measured():
-    """Splines run away there: the imprint that springs are laid about must not."""
+def test_foundation_where_a_corner_is_masked():
+    """Splines oscillate there; the imprint that the foundation is at rest with must not."""
     experiment, mask = palpation((6, 6, 2)), np.zeros((31, 31), bool)
     mask[:17, :17] = True
     y, x = np.mgrid[0:1:31j, 0:1:31j]
     pressed = 0.5 - 0.9 * np.maximum(0.55 - np.maximum(x, y) / 1.2, 0.0)
     thickness = op.ThicknessMap(pressed, extent=(SIDE, SIDE), std=NOISE, mask=mask)
-    observation = jax.tree.map(lambda leaf: leaf[None], observe(experiment.mesh(), thickness, NOISE))
-    assert observation.surface.min() < -1.0
-    bed = lay_bed(no_bed(experiment, observation, op.Matern(0.6, 1e-3)), experiment, observation, op.Newton())
-    assert bed is not None
-    assert jnp.all(bed.uz > -0.3)
+    surfaces = jax.tree.map(lambda leaf: leaf[None], project_map(experiment.mesh(), thickness, NOISE))
+    assert surfaces.surface.min() < -1.0
+    zero = zero_foundation(experiment, surfaces, op.Matern(0.6, 1e-3))
+    foundation = foundation_at_imprint(zero, experiment, surfaces, op.Newton(), 20.0)
+    assert foundation is not None
+    assert jnp.all(foundation.uz > -0.3)
 
 
 @pytest.mark.slow
-def test_springs_change_nothing_but_the_way(small, monkeypatch):
-    # Without friction nothing depends on the way, and both fits have one optimum.
+def test_foundation_does_not_change_the_optimum(small):
+    # Without friction nothing depends on the load path, and both fits have one optimum.
     experiment, (_, settings, prior, known) = palpation((6, 6, 2), window=0.0, sample=0.0), small
     thickness = small_map((experiment, settings, prior, known))
-    monkeypatch.setattr(opfem.inverse.fit, "_CG_NEGLIGIBLE", 3e-3)
 
-    def fit_closely():
-        fit = op.fit_traction(experiment, thickness, prior, solver=settings, rtol=1e-3, draws=2, progress=False)
+    def fit_closely(stiffness):
+        closely = op.FitSettings(rtol=1e-3, cg_negligible=3e-3, draws=2, foundation_stiffness=stiffness, progress=False)
+        fit = op.fit_traction(experiment, thickness, prior, settings=closely, solver=settings)
         return eqx.tree_at(lambda f: f.posterior.rtol, fit, 3e-3)
 
-    held = fit_closely()
-    monkeypatch.setattr(opfem.inverse.fit, "lay_bed", lambda *_: None)
-    dead = fit_closely()
-    assert dead.misfit.bed.stiffness == 0.0
-    assert held.misfit.bed.stiffness > 0.0
+    founded, dead = fit_closely(20.0), fit_closely(0.0)
+    assert dead.objective.foundation.stiffness == 0.0
+    assert founded.objective.foundation.stiffness > 0.0
     scale = float(jnp.max(dead.normal_std))
-    assert held.normal == pytest.approx(np.asarray(dead.normal), abs=0.02 * scale)
-    assert jnp.linalg.norm(held.normal - dead.normal) < 0.02 * jnp.linalg.norm(dead.normal_std)
-    assert held.chi2 == pytest.approx(float(dead.chi2), rel=0.01)
-    assert held.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
-    assert jnp.linalg.norm(held.normal_std) == pytest.approx(float(jnp.linalg.norm(dead.normal_std)), rel=0.03)
-    deviations, others = (fit.draws(jax.random.key(0), 4) - fit.normal for fit in (held, dead))
+    assert founded.normal == pytest.approx(np.asarray(dead.normal), abs=0.02 * scale)
+    assert jnp.linalg.norm(founded.normal - dead.normal) < 0.02 * jnp.linalg.norm(dead.normal_std)
+    assert founded.chi2 == pytest.approx(float(dead.chi2), rel=0.01)
+    assert founded.resolution_width == pytest.approx(np.asarray(dead.resolution_width), rel=0.05)
+    assert jnp.linalg.norm(founded.normal_std) == pytest.approx(float(jnp.linalg.norm(dead.normal_std)), rel=0.03)
+    deviations, others = (fit.draws(jax.random.key(0), 4) - fit.normal for fit in (founded, dead))
     assert deviations == pytest.approx(np.asarray(others), abs=0.05 * scale)
     weights = jnp.zeros((7, 7)).at[2:4, 1:4].set(1.0 / 6)
-    covariance, other = (fit.covariance(weights) for fit in (held, dead))
+    covariance, other = (fit.covariance(weights) for fit in (founded, dead))
     assert covariance == pytest.approx(np.asarray(other), abs=0.05 * float(jnp.max(jnp.abs(other))))
     assert jnp.sum(weights * covariance) == pytest.approx(float(jnp.sum(weights * other)), rel=0.02)
 
@@ -441,12 +440,12 @@ def test_displacements_inside_count_by_their_noise_where_they_were_measured(smal
     u, values = rng.standard_normal((1, 3, 3, 7, 7)), rng.standard_normal((3, 7, 7))
     std, mask = rng.uniform(0.5, 2.0, (3, 7, 7)), rng.random((3, 7, 7)) < 0.3
     flat = op.ThicknessMap(np.full((31, 31), 0.48), extent=(SIDE, SIDE), std=NOISE)
-    observations = jax.tree.map(lambda leaf: leaf[None], observe(experiment.mesh(), flat, NOISE))
+    observations = jax.tree.map(lambda leaf: leaf[None], project_map(experiment.mesh(), flat, NOISE))
 
     def inside(*args):
-        misfit = Misfit(
+        misfit = Objective(
             experiment, observations, prior, None, None, {}, None, stacked("inside", op.AxialDisplacement(*args), 1),
-            None, no_bed(experiment, observations, prior), settings.as_leaves(),
+            None, zero_foundation(experiment, observations, prior), settings.as_leaves(),
         )  # fmt: skip
         white = misfit.white(observations.surface)
         return misfit.residuals(white, jnp.asarray(u), jnp.ones(1))[0]["inside"][0]
@@ -512,34 +511,34 @@ def test_path_that_is_too_short_is_named(small):
         op.fit_traction(experiment, small_map(small), prior, solver=op.Newton(increments=3, max_path=2), progress=False)
 
 
-def looked_along(misfit):
-    """Look along the directions of a fit from zero until it stalls, six times at most."""
+def line_searched(misfit):
+    """Evaluate six trial points from zero at most, until the fit stalls."""
 
-    def followed(y, _):
-        return misfit(y), {"followed": jnp.ones((), bool), "carried": jnp.ones((), bool)}
+    def evaluated(y, _):
+        return misfit(y), {"within_max_path": jnp.ones((), bool), "in_equilibrium": jnp.ones((), bool)}
 
     rtol, number = jnp.asarray(1e-2), jnp.asarray
     descent = PreconditionedDescent(lambda J: lambda g: g, rtol, number(60), number(0.03), number(jnp.inf))
     solver = GaussNewton(rtol, descent)
-    state = solver.init(followed, y := jnp.zeros(3), None, {}, *jax.eval_shape(followed, y, None), frozenset())
+    state = solver.init(evaluated, y := jnp.zeros(3), None, {}, *jax.eval_shape(evaluated, y, None), frozenset())
     for _ in range(6):
-        y, state, _ = solver.step(followed, y, None, {}, state, frozenset())
-        done, _ = solver.terminate(followed, y, None, {}, state, frozenset())
-        status = opfem.inverse.fit._status(state, done)
+        y, state, _ = solver.step(evaluated, y, None, {}, state, frozenset())
+        done, _ = solver.terminate(evaluated, y, None, {}, state, frozenset())
+        status = _status(state, done, op.FitSettings().stall)
         if status != op.FitStatus.max_steps_reached:
             break
     return y, status
 
 
 def test_fit_stalls_where_no_step_along_its_direction_helps():
-    y, status = looked_along(lambda y: y - 10.0 + jnp.where(y > 1e-3, 1e3, 0.0))
+    y, status = line_searched(lambda y: y - 10.0 + jnp.where(y > 1e-3, 1e3, 0.0))
     assert status == op.FitStatus.stalled
     assert jnp.all(y == 0.0)
 
 
 def test_fit_goes_on_where_its_misfit_jumps_a_little():
     """As where a solve cuts an increment back: at zero lower than all around, by 0.3 % of the sum of squares, 300."""
-    y, _ = looked_along(lambda y: jnp.append(y - 10.0 + jnp.where(y > 0.5, 1e3, 0.0), jnp.where(y[0] > 0.0, 1.0, 0.0)))
+    y, _ = line_searched(lambda y: jnp.append(y - 10.0 + jnp.where(y > 0.5, 1e3, 0.0), jnp.where(y[0] > 0.0, 1.0, 0.0)))
     assert jnp.all(y > 0.0)
 
 

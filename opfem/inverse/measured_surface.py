@@ -1,8 +1,7 @@
-"""The measured map as the fit sees it: a surface on mesh-spaced cubic splines, and how certain it is.
+"""The measured map projected onto mesh-spaced cubic splines, with its precision.
 
-The map is projected once. What the splines cannot follow (`representation`) says nothing about the traction and is
-kept apart from the noise. The deformed interface is then looked at from the map: at every node of the mesh's own grid
-in space, the interface's height there, whichever point of the layer has moved below.
+The map is projected once; the representation error, what the splines cannot follow, is kept apart from the noise.
+The deformed interface is compared at spatial positions: its height at every node of the mesh's undeformed grid.
 """
 
 import equinox as eqx
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._checks import concrete
 from .._types import Map, ScalarLike
 from ..measurement import ThicknessMap
 from ..mechanics.interface_point import locate
@@ -19,23 +19,23 @@ from ..model import HeightField, LayerMesh
 Nodes = Float[Array, "my mx"]
 # Gaussian standard deviation over its full width at half maximum.
 _PER_FWHM = 1.0 / np.sqrt(8.0 * np.log(2.0))
-# Stiffness of the splines between pixels, over the mean precision of a node: what masked nodes follow.
+# Bending penalty of the splines over the mean precision of a node: it determines masked nodes only.
 _BENDING = 1e-6
-# Pixels this far outside, in elements, still lie on the layer: round-off of its edge.
+# Tolerance of the layer's edge, in elements: the round-off of a pixel's coordinate.
 _ON_EDGE = 1e-9
 
 
-class Observation(eqx.Module):
-    """A measured surface on the mesh's grid.
+class MeasuredSurface(eqx.Module):
+    """A measured surface at the nodes of the mesh's grid.
 
     Attributes:
         surface: Height of the measured surface at the grid's nodes [mm].
-        to_rows: Rows of pixels from rows of nodes `(py, my)`.
-        to_columns: Columns of pixels from columns of nodes `(px, mx)`.
-        certainty: One over the standard deviation of every pixel [1/mm], correlation counted in; 0 where none.
-        representation: Pixels minus the surface [mm], 0 where no pixel counts.
-        informed: How many spline coefficients the pixels determine [-].
-        model_std: The model's own error that `certainty` allows for [mm].
+        to_rows: Spline values of pixel rows from node rows `(py, my)`.
+        to_columns: Spline values of pixel columns from node columns `(px, mx)`.
+        certainty: Reciprocal standard deviation of every pixel [1/mm], correlation included; 0 for masked pixels.
+        representation: Representation error, pixels minus the surface [mm]; 0 for masked pixels.
+        informed: Number of spline coefficients that the pixels determine [-].
+        model_std: Standard deviation of the model error that `certainty` includes [mm].
     """
 
     surface: Nodes
@@ -47,39 +47,38 @@ class Observation(eqx.Module):
     model_std: Array
 
     def misfit(self, heights: Nodes) -> Map:
-        """Compare heights of the interface [mm] with the measured surface, pixel by pixel, over its noise [-]."""
+        """Compute the standardised misfit of interface heights [mm] at every pixel [-]."""
         return self.misfit_change(heights - self.surface)
 
     def misfit_change(self, change: Nodes) -> Map:
-        """Compute how the misfit changes with the interface's heights [-]."""
+        """Compute the change of the misfit [-] with a change of the interface heights [mm]."""
         return self.certainty * (self.to_rows @ change @ self.to_columns.T)
 
     @property
     def precision(self) -> Nodes:
-        """How certain the surface is near every node [1/mm²]: row sums of the inverse covariance."""
+        """Precision of the surface at every node [1/mm²]: row sums of the inverse covariance."""
         return jnp.abs(self.to_rows).T @ self.certainty**2 @ jnp.abs(self.to_columns)
 
     @property
     def representation_rms(self) -> Array:
-        """Root mean square of what the splines cannot follow [mm]."""
+        """Root mean square of the representation error [mm]."""
         counted = jnp.sum(self.certainty > 0)
         return jnp.sqrt(jnp.sum(self.representation**2) / jnp.maximum(counted, 1))
 
 
-def observe(
+def project_map(
     mesh: LayerMesh, thickness: ThicknessMap, std: ScalarLike | Map, model_std: ScalarLike = 0.0
-) -> Observation:
+) -> MeasuredSurface:
     """Project a map onto the mesh's splines.
 
-    Noise that is correlated over less than about two elements acts like white noise of the same power at long
-    waves; it enters as that, which takes its shorter waves for a little larger than they are. The model's own error,
-    one value per element's area, enters in the same way.
+    Noise correlated over less than about two elements enters as white noise of the same power at long waves, which
+    slightly overestimates its short waves. The model error, one value per element, enters in the same way.
 
     Args:
         mesh: The layer's mesh.
         thickness: The measured map.
         std: Standard deviation of the noise of its pixels [mm], a number or a map.
-        model_std: Standard deviation of the height that the model computes [mm].
+        model_std: Standard deviation of the computed height [mm].
     """
     (hx, hy), (my, mx) = mesh.spacing, mesh.thickness.shape
     rows, inside_y = _spline_values(thickness.y / hy, my - 1)
@@ -103,13 +102,15 @@ def observe(
     surface, _ = jax.scipy.sparse.linalg.cg(normal, right, tol=1e-12, maxiter=40 * max(my, mx))
     representation = jnp.where(counted, values - rows @ surface @ columns.T, 0.0)
     share = (rows**2).T @ weight @ columns**2 / jnp.where(precision > 0, precision, 1.0)
-    return Observation(surface, rows, columns, certainty, representation, jnp.sum(share > 1e-3), jnp.asarray(model_std))
+    return MeasuredSurface(
+        surface, rows, columns, certainty, representation, jnp.sum(share > 1e-3), jnp.asarray(model_std)
+    )
 
 
 def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
-    """Find the height of the deformed interface [mm] at the places of the mesh's undeformed nodes.
+    """Compute the height of the deformed interface [mm] at the positions of the mesh's undeformed nodes.
 
-    Beyond the layer's edges it continues at its edge value.
+    Beyond the layer's edges the edge value continues.
 
     Args:
         mesh: The layer's mesh.
@@ -133,7 +134,7 @@ def _both(fields: HeightField, x: Array, y: Array) -> tuple[Array, Array, Array]
 
 
 def _spline_values(t: Float[Array, " points"], cells: int) -> tuple[Array, Array]:
-    """Return the matrix from node values to a spline's values at points, in cells; and which points lie on it."""
+    """Return the matrix from node values to spline values at points, in cells; and which points lie on the layer."""
     distance = jnp.abs(t[:, None] - np.arange(-1, cells + 2))
     basis = (jnp.maximum(2.0 - distance, 0.0) ** 3 - 4.0 * jnp.maximum(1.0 - distance, 0.0) ** 3) / 6.0
     inside = (t >= -_ON_EDGE) & (t <= cells + _ON_EDGE)
@@ -154,7 +155,7 @@ def _bending(n: int) -> np.ndarray:
 
 
 def _correlated_pixels(thickness: ThicknessMap) -> Array:
-    """Compute how many pixels share one pixel's noise: the sum of its correlations with all others, itself included."""
+    """Compute the number of pixels that share one pixel's noise: the sum of the correlations with all pixels."""
     scale = thickness.noise_length * _PER_FWHM
 
     def along(spacing, n):
@@ -162,3 +163,27 @@ def _correlated_pixels(thickness: ThicknessMap) -> Array:
         return 1.0 + 2.0 * jnp.sum(jnp.exp(-(d**2) / jnp.where(scale > 0, 4.0 * scale**2, 1.0))) * (scale > 0)
 
     return along(thickness.spacing[0], thickness.shape[1]) * along(thickness.spacing[1], thickness.shape[0])
+
+
+def noise_std(caller: str, thickness: ThicknessMap) -> Array:
+    """Return the standard deviation of a map's noise [mm].
+
+    Raises:
+        ValueError: If it is missing or not positive; a fit weighs map against prior by it.
+    """
+    if not isinstance(thickness, ThicknessMap):
+        raise ValueError(f"{caller} needs a ThicknessMap, got {type(thickness).__name__}.")
+    if thickness.std is None:
+        raise ValueError(
+            f"{caller} needs the standard deviation of the map's noise, thickness.std [mm], got None. "
+            "Measure it on a flat target or between repeated scans, and pass read_thickness(..., std=0.002)."
+        )
+    std, mask = concrete(thickness.std), concrete(thickness.mask)
+    if std is not None and mask is not None:
+        used = np.broadcast_to(std, thickness.shape)[~mask]
+        if not (used > 0).all():
+            raise ValueError(
+                f"{caller}: thickness.std [mm] must be positive where pixels are data, got {used.min():g}. "
+                "A pixel of zero noise would outweigh all others; pass the standard deviation between repeated scans."
+            )
+    return thickness.std

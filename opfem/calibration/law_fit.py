@@ -1,7 +1,7 @@
-"""A material law from stress–strain curves: least squares by optimistix, with what the curves can and cannot tell.
+"""Fit of a material law to stress–strain curves: least squares by optimistix, with covariance and stability.
 
-Nominal stress is compared with the law's; every curve has an offset of its own, in stress or in strain, because the
-zeros of a load frame are those of its sensors and not of the specimen.
+The residual is the nominal stress of the law minus the measured one. Every curve has a separate offset, in stress or in
+strain: the zeros of a load frame are those of its sensors, not of the specimen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,10 +29,10 @@ from .result import Calibration
 
 _MOST_STEPS = 1000
 _RTOL = 1e-13  # of the numbers and of the sum of squares: exact data gives the numbers to 1e-8
-_SMALLEST = 0.05  # of the largest stress: with weights "relative" no point counts for more
+_SMALLEST = 0.05  # of the largest stress, below which weights "relative" are constant
 _EDGE = 1e-9  # relative round-off of a range's ends
-_CUT = 1e-10  # singular values of the scaled Jacobian below this part of the largest are taken for it
-# Exponents that a fit of Ogden starts from, by its number of terms: the best end counts.
+_CUT = 1e-10  # relative cut-off of singular values of the scaled Jacobian
+# Initial exponents of an Ogden fit, by its number of terms; the best of the fits is returned.
 _EXPONENTS = {
     1: [[2.0], [-2.0], [6.0], [-6.0]],
     2: [[2.0, -2.0], [1.3, 5.0], [4.0, -4.0], [-2.0, -8.0]],
@@ -62,8 +62,8 @@ def calibrate(
         law: "neo_hooke", "mooney_rivlin", "yeoh", "ogden", "hencky", or a class of law.
         bulk: Bulk over shear modulus [-]; None fits, and returns, an incompressible law (`bulk = inf`, which needs
             `element="hybrid"`).
-        offset: Whether each curve has an offset of its own.
-        toe: What it is: an offset in "stress" [MPa], or in "strain" [-], by which contact came late.
+        offset: Whether each curve has a separate offset.
+        toe: Kind of offset: in "stress" [MPa], or in "strain" [-] for late contact.
         terms: Terms of "ogden".
         start: Numbers to start from, by name; needed for a class that is not one of the five.
         weights: "absolute": every point counts alike (or by its `std`); "relative": by its stress.
@@ -77,8 +77,8 @@ def calibrate(
         The law, ready to use, with covariance, stable range and advice.
 
     Raises:
-        MeasurementError: Where the curves lead to no law: a modulus that is not positive, an unstable fit.
-        ValueError: For arguments that mean nothing.
+        MeasurementError: If the modulus is not positive or the fitted law is unstable.
+        ValueError: For invalid arguments.
 
     Example:
         >>> import jax, numpy as np
@@ -115,9 +115,9 @@ def _check(measured: list[Any], bulk: Any, toe: str, weights: str, platens: str,
     if not measured or not all(isinstance(curve, StressStrain) for curve in measured):
         raise ValueError(f"calibrate.data must be one StressStrain or several, got {measured!r}.")
     choices = {"toe": ("stress", "strain"), "weights": ("absolute", "relative"), "platens": ("lubricated", "bonded")}
-    for (name, known), value in zip(choices.items(), (toe, weights, platens), strict=True):
-        if value not in known:
-            raise ValueError(f"calibrate.{name} must be one of {', '.join(known)}, got {value!r}.")
+    for (name, valid), value in zip(choices.items(), (toe, weights, platens), strict=True):
+        if value not in valid:
+            raise ValueError(f"calibrate.{name} must be one of {', '.join(valid)}, got {value!r}.")
     if bulk is not None and not bulk > 1.0:
         raise ValueError(f"calibrate.bulk [-] is the bulk over the shear modulus and must be above 1, got {bulk!r}.")
     if terms not in _EXPONENTS:
@@ -155,20 +155,20 @@ def _starts(kind: type, curves: Curves, terms: int, start: Mapping[str, Any] | N
             "one of them wrong? In compression the stretch is below one and the nominal stress negative."
         )
     zero = jnp.zeros(())
-    known: dict[type, list[dict[str, Array]]] = {
+    initial: dict[type, list[dict[str, Array]]] = {
         NeoHooke: [{"c10": shear / 2}],
         MooneyRivlin: [{"c10": 0.4 * shear, "c01": 0.1 * shear}],
         Yeoh: [{"c10": shear / 2, "c20": zero, "c30": zero}],
         Hencky: [{"shear": shear}],
         Ogden: [{"mu": jnp.full(terms, shear / terms), "alpha": jnp.asarray(alpha)} for alpha in _EXPONENTS[terms]],
     }
-    if kind not in known:
+    if kind not in initial:
         raise ValueError(f"calibrate: {kind.__name__} needs start=, its numbers by name.")
-    return known[kind]
+    return initial[kind]
 
 
 class _Fitted(eqx.Module):
-    """Where a fit ended: unknowns, residuals [MPa] and their Jacobian by the unknowns in a row."""
+    """Optimum of a fit: unknowns, residuals [MPa] and their Jacobian by the flat unknowns."""
 
     unknown: Unknown
     residuals: Float[Array, " n"]
@@ -176,7 +176,7 @@ class _Fitted(eqx.Module):
 
 
 def _best(model: LawModel, curves: Curves, starts: list[Unknown]) -> _Fitted:
-    """Fit from every start and take the best end."""
+    """Fit from every start and return the best optimum."""
     fitted = [_fit(model, curves, start) for start in starts]
     losses = [float(jnp.sum(one.residuals**2)) for one in fitted]
     if not np.isfinite(losses).any():
@@ -215,7 +215,7 @@ def _fit(model: LawModel, curves: Curves, start: Unknown) -> _Fitted:
 def _judged(
     model: LawModel, curves: Curves, measured: tuple[StressStrain, ...], fitted: _Fitted, factor: float
 ) -> Calibration:
-    """Put the result together; refuse what is no material."""
+    """Assemble the result; raise MeasurementError where it is no material."""
     try:
         law = model.material(fitted.unknown)
     except ValueError as cause:
@@ -261,7 +261,7 @@ def _mooney(curves: Curves, power: float) -> list[float]:
         model.measured({"numbers": {"c10": jnp.asarray(a), "c01": jnp.asarray(1.0 - a)}, "offset": zero}, curves)
         for a in (1.0, 0.0)
     ]
-    # What an offset fits is the mean of each curve.
+    # An offset fits the mean of each curve exactly.
     basis = [np.concatenate([np.asarray(one - one.mean()) for one in parts]) for parts in unit]
     stresses = [s * stretch**power for s, stretch in zip(curves.nominal, curves.stretch, strict=True)]
     y = np.concatenate([np.asarray(one - one.mean()) for one in stresses])
@@ -270,7 +270,7 @@ def _mooney(curves: Curves, power: float) -> list[float]:
 
 
 def _check_stable(found: Calibration) -> None:
-    """Refuse a law that is unstable where it was fitted."""
+    """Raise MeasurementError for a law that is unstable within a curve."""
     for curve in found.data:
         low, high = found.stability[curve.mode]
         least, largest = float(jnp.min(curve.stretch)), float(jnp.max(curve.stretch))
