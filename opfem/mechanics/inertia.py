@@ -1,4 +1,4 @@
-"""What dynamics adds to statics: lumped mass, the stable time increment and bulk viscosity of a layer.
+"""Terms of dynamics: lumped mass, stable time increment and bulk viscosity of a layer.
 
 Used by the explicit solver; forces stay in `internal` and `layer_force`.
 """
@@ -16,7 +16,7 @@ from .kinematics import CellKind, LayerCells, contract
 
 Cells = Float[Array, "nz ny nx"]
 
-# Σ |∇N|² over the nodes of each of a box's six tetrahedra is twice Σ 1/L²: no frequency exceeds it.
+# Σ |∇N|² over the nodes of each of a box's six tetrahedra is twice Σ 1/L²: an upper bound of frequencies.
 _TETRAHEDRA = 2.0
 
 

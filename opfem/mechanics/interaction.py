@@ -1,8 +1,8 @@
 """Contact and friction of faces of the layer with a rigid surface, at their face points.
 
-Pressure follows the overclosure law along the surface's true normal, on the current area.
-Friction is Coulomb's with elastic slip and a return map; the slip of a point is measured along
-the surface, in the surface's own (x, y), and its history is carried from increment to increment.
+Pressure follows the overclosure law along the surface's true normal, on the current area. Friction is Coulomb's, with
+elastic slip and a return map. The slip of a point is measured along the surface, in (x, y) of the surface, with a
+history over the increments.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,9 +30,9 @@ from .contact_state import (
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
 from .kinematics import contract
 from .paired_contact import PairedContact, PairedSurface, split
-from .staging import apart
+from .unfused import unfused
 
-# Share of the largest elastic slip from which a point counts as slipping.
+# Share of the elastic limit from which on the status of a point is "slip".
 _AT_LIMIT = 0.9
 
 
@@ -43,13 +43,13 @@ class ContactFace(eqx.Module):
         contact: Law and friction.
         surface: The rigid surface.
         offset: Shift of the surface away from the layer [mm]; of each of them where they are paired.
-        imposed: For a `Traction` load, whose dead pressure only bounds friction, and whose springs push.
+        imposed: Pressure of a `Traction` load: its dead part only bounds friction, its elastic foundation acts.
         element_size: Size of an element [mm]; default elastic slip is a fraction of it.
         stiffness: Stiffness of an element per area [MPa/mm], the scale of hard contact.
         above: True for the sample, False for the window; of each of them where they are paired.
-        rule: Where contact is integrated.
-        sides: Which faces are sides, pushed only where they have turned towards the surface; None: none.
-        shares: What each point stands for where the points of a face are not alike (`node_shares`).
+        rule: Quadrature of contact.
+        sides: Mask of faces that are sides, in contact only where they have turned towards the surface; None: none.
+        shares: Weight of each point where the points of a face differ (`node_shares`).
     """
 
     contact: Contact | PairedContact
@@ -70,7 +70,7 @@ class ContactFace(eqx.Module):
         return self.contact
 
     def initial_history(self, x: Corners) -> SlipHistory:
-        """Build the history of a face that has not slipped."""
+        """Build the history of a face without slip."""
         position = surface_tangents(x, self.rule)[0][:2]
         zero = jnp.zeros_like(position)
         return SlipHistory(position, zero, zero, jnp.zeros((), position.dtype), zero[0])
@@ -86,13 +86,13 @@ class ContactFace(eqx.Module):
         d = (
             under(self.surface, fraction, position)
             if self.surface.is_plane
-            else apart(under, self.surface, fraction, position)
+            else unfused(under, self.surface, fraction, position)
         )
         bend = jnp.stack([jnp.stack([d[0, 2], d[1, 1]]), jnp.stack([d[1, 1], d[2, 0]])]) if bends else None
         return FacePoints(fraction, position, jnp.stack(tangents), d[0, 0], jnp.stack([d[0, 1], d[1, 0]]), bend)
 
     def at_points(self, points: FacePoints, history: SlipHistory, law: TangentLaw | None = None) -> PointContact:
-        """Evaluate contact at face points, with the contact's own law or a linearised one."""
+        """Evaluate contact at face points, by the nonlinear law or a linearised one."""
         clearance = self.clearance(points)
         pressure, push, _, _ = self._pressure(points, clearance, law or self.own_law(history))
         friction = self.friction(pressure, points, history, None if law is None else law.sticks)
@@ -108,7 +108,7 @@ class ContactFace(eqx.Module):
         )
 
     def _side(self, points: Array) -> np.ndarray:
-        """Say on which side of the layer the surface is: 1 above, -1 below; broadcasts to points."""
+        """Return the side of the layer that the surface is on: 1 above, -1 below; broadcasts to points."""
         side = np.where(self.above, 1.0, -1.0)
         return np.repeat(side, points.shape[-1] // side.size) if side.ndim else side
 
@@ -122,29 +122,29 @@ class ContactFace(eqx.Module):
 
     @property
     def is_exact(self) -> bool:
-        """Whether the pressure is to be reached without penetration."""
+        """Whether the method of multipliers removes penetration."""
         return self.own_contact.law.exact and self.imposed is None
 
-    def _carried(self, history: SlipHistory) -> Array | float:
-        """Compute the clearance [mm] that the law is shifted by: exact hard contact carries its pressure without."""
-        return 0.0 if self.imposed is not None else self.contact.law.carried(history.pressure, self.stiffness)
+    def _shift(self, history: SlipHistory) -> Array | float:
+        """Compute the shift of the law's clearance [mm] by the multiplier of exact hard contact."""
+        return 0.0 if self.imposed is not None else self.contact.law.multiplier_shift(history.pressure, self.stiffness)
 
     def own_law(self, history: SlipHistory) -> Callable[[Array], Array]:
-        """Take the contact's pressure as a function of clearance [mm], shifted where it is exact."""
-        carried = self._carried(history)
-        return lambda clearance: self.contact.law.pressure_at(clearance + carried, self.stiffness)
+        """Return the pressure as a function of clearance [mm], shifted by the multiplier of exact contact."""
+        shift = self._shift(history)
+        return lambda clearance: self.contact.law.pressure_at(clearance + shift, self.stiffness)
 
     def missed_gap(self, before: SlipHistory, after: SlipHistory) -> Array:
-        """Compute the largest gap or penetration [mm] that an increment left to exact contact; 0 for other laws."""
+        """Compute the largest gap or penetration [mm] of exact contact after an increment; 0 for other laws."""
         if not self.is_exact:
             return jnp.zeros_like(after.dissipated)
         gap = self.contact.law.clearance_at(after.pressure - before.pressure, self.stiffness)
         return jnp.max(jnp.where(after.pressure > 0, jnp.abs(gap), 0.0))
 
     def _pressure(self, points: FacePoints, clearance: Array, law) -> tuple[Array, Array, Array, Array]:
-        """Compute the pressure that bounds friction and that which pushes [MPa], and their slopes [MPa/mm].
+        """Compute the pressure that bounds friction and the applied one [MPa], and their slopes [MPa/mm].
 
-        Slopes are by clearance; by height under an imposed pressure.
+        Slopes are derivatives by clearance; by height under an imposed pressure.
         """
         imposed = self.imposed
         if imposed is not None:
@@ -156,7 +156,7 @@ class ContactFace(eqx.Module):
         return pressure, pressure, slope, slope
 
     def initial_iterate(self, history: SlipHistory) -> ContactIterate:
-        """Start from the pressure of the last increment, as if every point had stuck."""
+        """Initialise with the pressure of the last increment and stick at every point."""
         return ContactIterate(history.pressure, jnp.zeros_like(history.elastic), jnp.zeros_like(history.pressure))
 
     def tangent_law(
@@ -164,25 +164,24 @@ class ContactFace(eqx.Module):
     ) -> TangentLaw:
         """Linearise contact at face points.
 
-        A point without pressure that has come to touch takes what the law gives there, at most
-        the pressure that shortens an element by a thousandth.
+        A newly closed point has the pressure of the law, bounded by that which shortens an element by a thousandth.
         """
         sticks = jnp.sum(_trial(points, history) * iterate.direction, axis=0) < 0
         clearance = self.clearance(points)
         most = 1e-3 * self.stiffness * self.element_size
         law = self.own_law(history)
         pressure = jnp.maximum(iterate.pressure, jnp.minimum(law(clearance), most))
-        at = self.contact.law.clearance_at(pressure, self.stiffness) - self._carried(history)
+        at = self.contact.law.clearance_at(pressure, self.stiffness) - self._shift(history)
         slope = jax.jvp(law, (at,), (jnp.ones_like(at),))[1]
-        # Whether a point opens is decided with the layer's own stiffness: the stiff law's would
-        # open half of a face at the first micrometre of error.
+        # Opening of a point is decided with the stiffness of the layer: that of a stiff law would open half of a face
+        # at the first micrometre of error.
         closed = (pressure - self.stiffness * (clearance - at) >= 0) & (slope < 0)
         return TangentLaw(jnp.where(closed, pressure, 0.0), at, jnp.where(closed, slope, 0.0), sticks, curvature)
 
     def follow(self, points: FacePoints, change: Corners, history: SlipHistory, law: TangentLaw) -> ContactIterate:
-        """Compute what the next iteration remembers once a part of the step `change` is taken (`after`).
+        """Update the contact iterate after a part of the step `change` (`after`).
 
-        The pressure follows the clearance's linear change.
+        The pressure follows the linear change of the clearance.
         """
         step = jnp.moveaxis(contract(quadrature(self.rule).N, change), 1, 0)
         clearance = self.clearance(points)
@@ -197,7 +196,7 @@ class ContactFace(eqx.Module):
         return points.normal * -self._side(clearance) - clearance / points.stretch * _stretch_slope(points, curvature)
 
     def friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "Friction":
-        """Compute Coulomb friction at face points; points that `sticks` names do."""
+        """Compute Coulomb friction at face points; points in `sticks` stick."""
         trial, (slope_x, slope_y) = _trial(points, history), points.slope
         rise = slope_x * trial[0] + slope_y * trial[1]
         squared = trial[0] ** 2 + trial[1] ** 2 + rise**2
@@ -230,7 +229,7 @@ class ContactFace(eqx.Module):
         """Compute the traction [MPa], its derivative by the points' positions, and the guard [MPa/mm].
 
         All in closed form: component i by position j `(3 i, 3 j, points, *faces)`. The guard is the symmetric positive
-        part of minus the derivative: without curvature and sliding's coupling.
+        part of minus the derivative: without curvature and frictional coupling.
         """
         curvature, sticks = (1.0, None) if law is None else (law.curvature, law.sticks)
         assert points.bend is not None
@@ -240,7 +239,7 @@ class ContactFace(eqx.Module):
         if self.imposed is None:
             by_clearance = self._clearance_slope(points, clearance, curvature)
         else:
-            by_clearance = jnp.zeros_like(normal).at[2].set(1.0)  # the springs' height takes its place
+            by_clearance = jnp.zeros_like(normal).at[2].set(1.0)  # the foundation depends on height instead
         by_pressure, by_push = slope * by_clearance, push_slope * by_clearance
         bend = jnp.pad(curvature * points.bend, [(0, 1), (0, 1)] + [(0, 0)] * pressure.ndim)
         by_normal = -(bend + normal[:, None] * _stretch_slope(points, curvature)) / stretch
@@ -272,7 +271,7 @@ class ContactFace(eqx.Module):
         return self.contact.slip_limit(pressure, self.element_size)
 
     def _area(self, tangents: Float[Array, "2 3 points *faces"]) -> Float[Array, "points *faces"]:
-        """Compute the area per unit of (ξ, η) that the surface pushes on [mm²]."""
+        """Compute the contact area per unit of (ξ, η) [mm²]."""
         area = self._whole_area(tangents)
         return area if self.shares is None else area * self.shares
 
@@ -297,10 +296,10 @@ class ContactFace(eqx.Module):
 
         Returns:
             The exact matrix (not symmetric when points slide), and its symmetric positive part
-            for the preconditioner: without curvature, area change and sliding's coupling.
+            for the preconditioner: without curvature, area change and frictional coupling.
         """
         q = quadrature(self.rule)
-        now, by_position, guard = apart(lambda face, *args: face._linearised(*args), self, points, history, law)
+        now, by_position, guard = unfused(lambda face, *args: face._linearised(*args), self, points, history, law)
         area, pull_back = jax.vjp(self._area, points.tangents)
         (by_tangents,) = pull_back(jnp.broadcast_to(1.0 if law is None else law.curvature, area.shape))
         slopes = jnp.concatenate([(by_position * area)[None], by_tangents[:, None] * now[None, :, None]])
@@ -325,13 +324,13 @@ class ContactFace(eqx.Module):
 def positive_part(
     normal: PointVector, pushing: Array, sticking: Array, friction: "Friction"
 ) -> Float[Array, "3 3 points *faces"]:
-    """Compute the symmetric positive part of contact's stiffness [MPa/mm]: without curvature and sliding's coupling.
+    """Compute the symmetric positive part of contact's stiffness [MPa/mm]: without curvature and frictional coupling.
 
     Args:
-        normal: Of the surface.
-        pushing: Stiffness along it.
-        sticking: Stiffness across it, but along the slip of points that slide.
-        friction: Friction there.
+        normal: Normal of the surface.
+        pushing: Normal stiffness.
+        sticking: Tangential stiffness, of sliding points across their slip only.
+        friction: Friction at the points.
     """
     along, eye = normal[:, None] * normal, np.eye(3).reshape(3, 3, *[1] * (normal.ndim - 1))
     length = jnp.where(friction.limited, friction.length, 1.0)
@@ -340,7 +339,7 @@ def positive_part(
 
 
 def _trial(points: FacePoints, history: SlipHistory) -> Float[Array, "2 points *faces"]:
-    """Compute the elastic slip [mm] of points that would all stick."""
+    """Compute the trial elastic slip [mm], for stick at all points."""
     anchor = history.position if points.anchor is None else points.anchor
     return history.elastic + points.position[:2] - anchor
 
@@ -353,13 +352,13 @@ def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
 
 
 class Touch(NamedTuple):
-    """Contact faces that are evaluated as one, and which bodies they belong to."""
+    """Contact faces that are evaluated together, and the bodies they belong to."""
 
     names: tuple[str, ...]
     face: ContactFace
 
     def history(self, histories: Bodies) -> SlipHistory:
-        """Put the friction histories of the bodies side by side."""
+        """Concatenate the friction histories of the bodies."""
         return joined_histories([getattr(histories, name) for name in self.names])
 
     def split(self, values: Any) -> dict[str, Any]:
@@ -368,7 +367,7 @@ class Touch(NamedTuple):
 
 
 def paired(faces: Sequence[ContactFace]) -> ContactFace:
-    """Make one contact face of several (`can_pair`)."""
+    """Combine several contact faces into one (`can_pair`)."""
     first, count = faces[0], len(faces)
     if count == 1:
         return first
@@ -391,21 +390,21 @@ def paired(faces: Sequence[ContactFace]) -> ContactFace:
 
 
 def can_pair(faces: Sequence[ContactFace]) -> bool:
-    """Tell whether contact faces are integrated alike, so that they can be evaluated as one."""
+    """Return whether contact faces have the same quadrature, so that they can be evaluated together."""
     alike = {(face.rule, face.sides is None) for face in faces}
     return len(alike) == 1 and all(face.imposed is None for face in faces)
 
 
 class Friction(NamedTuple):
-    """Friction at face points: traction [MPa], and what its derivatives take."""
+    """Friction at face points: traction [MPa], and the quantities that its derivatives need."""
 
     traction: Array
-    stiffness: Array  # of the points as they are, slid or not [MPa/mm]
-    reach: Array  # elastic slip if all points stuck, in space [mm]
+    stiffness: Array  # tangential stiffness [MPa/mm], of stick or slip
+    reach: Array  # trial elastic slip, in space [mm]
     length: Array  # of it [mm]
     elastic: Array
     slid: Array
     conjugate: Array
-    limited: Array  # whether friction is at its limit, where there is any
+    limited: Array  # whether friction, if any, is at its limit
     sliding: Array
     slips: Array

@@ -1,8 +1,8 @@
 """Newton's method for one load increment, and its settings.
 
-Displacement and contact pressure are unknowns together, the pressure eliminated point by point
-(`TangentLaw`). Each step assembles the tangent, solves it by preconditioned GMRES, shortens the
-moves of single nodes that stand out, and is taken whole unless an element would invert.
+Displacement and contact pressure are unknowns; the pressure is eliminated point by point (`TangentLaw`). Each step
+assembles the tangent, solves it by preconditioned GMRES, limits displacements of outlying nodes, and is halved only
+where an element would invert.
 """
 
 from typing import Any, NamedTuple
@@ -20,8 +20,8 @@ from .equations import AbstractProblem, State
 from .krylov import KrylovResult, fgmres
 from .tangent import AbstractTangent, Unknowns
 
-# Relative residual below which the tangent takes in curvature and area change. Above, the pressures
-# are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
+# Relative residual below which the tangent includes curvature and area change. Above, pressures have not converged,
+# and these terms, proportional to pressure, would make the tangent indefinite.
 _SETTLED = 0.3
 # An increment is cut after this many steps in a row that end above; on the coin, those that converge have at most six.
 _MOST_UNSETTLED = 10
@@ -36,8 +36,7 @@ class Newton(eqx.Module):
 
     The load is applied in `increments` equal parts. An increment that does not converge is cut
     and repeated from the last converged state, its friction history restored; increments grow
-    again up to that size. Where the layer snaps and no increment helps, it is taken through a viscous
-    medium (`stepping`).
+    again up to that size. Snap-through is solved with viscous regularisation (`stepping`).
 
     Args:
         rtol: Unbalanced force over contact force [-] at convergence (Euclidean norms). The coin's map is within 2e-6
@@ -45,17 +44,17 @@ class Newton(eqx.Module):
             1e-10 before comparing with finite differences.
         increments: Load increments when none is cut.
         max_steps: Newton steps per increment before it is cut.
-        min_increment: Smallest load increment [-] before the solve gives up.
-        max_increments: Most increments tried, repeated ones included.
+        min_increment: Smallest load increment [-]; the solve fails below it.
+        max_increments: Limit of increments, repeated ones included.
         krylov_rtol: Relative residual of each linear solve [-]. On the coin 3e-2 takes a fifth less time, but fails on
             a layer of which three quarters are lifted off; 1e-1 and 1e-3 take longer.
-        krylov_steps: Most preconditioner applications per linear solve.
+        krylov_steps: Limit of preconditioner applications per linear solve.
         max_backtracks: Halvings of a Newton step that inverts an element, before the increment is cut.
-        step_limit: Furthest move of a node in one Newton step, in mean thicknesses of the layer, beyond four
-            times the mean move: a corner that slips over a ridge must not take its neighbours along.
-        max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
-            solve keeps as many displacement fields. Beyond, derivatives are NaN.
-        face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
+        step_limit: Limit of a node's displacement in one Newton step, in mean thicknesses of the layer, where it
+            exceeds four times the mean: a corner that slips over a ridge must not distort its neighbours.
+        max_path: Limit of accepted increments for derivatives: under `jax.grad` and the like, a solve stores as many
+            displacement fields. Beyond, derivatives are NaN.
+        face_rule: Quadrature of contact: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
             sample of exact hard contact, always at the nodes.
 
     Raises:
@@ -75,7 +74,7 @@ class Newton(eqx.Module):
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
 
     def as_leaves(self) -> "Newton":
-        """Make every number an array, so that another value compiles nothing anew."""
+        """Convert every number to an array, so that another value needs no compilation."""
         return jax.tree.map(lambda v: jnp.asarray(float(v) if isinstance(v, np.floating) else v), self)
 
     def __check_init__(self):
@@ -106,7 +105,7 @@ class IncrementResult(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration is: `x + length × direction` is looked at next, its length at most 1."""
+    """State of the iteration: the next trial point is `x + length × direction`, with length at most 1."""
 
     x: Unknowns
     direction: Unknowns
@@ -123,18 +122,18 @@ class _Iterate(NamedTuple):
 
 
 def solve_increment(
-    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
+    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, hold_active: Array, settings: Newton
 ) -> IncrementResult:
     """Find equilibrium at a load fraction, from a converged state and a first guess.
 
-    One pass of the loop takes the step that the pass before found, and finds the next: in this order the residual
-    appears, and is compiled, once.
+    Each pass of the loop takes the step of the previous pass and solves for the next: in this order the residual is
+    compiled once.
     """
 
     def evaluate(x):
         points = problem.locate(x.u, fraction, state, bends=True)
         forces = problem.with_contact(problem.own_forces(x, state), points, fraction, state)
-        size = problem.size(problem.residual(forces, held))
+        size = problem.size(problem.residual(forces, hold_active))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
         return (forces, points), size, settings.rtol * problem.force_scale(forces)
 
@@ -173,10 +172,10 @@ def solve_increment(
     def find_step(it):
         curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
         laws = problem.tangent_laws(it.points, state, it.contact, curvature)
-        r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), held)
+        r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), hold_active)
         tangent = problem.tangent(it.x, fraction, state, laws, points=it.points)
-        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
-        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), held)
+        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), hold_active, settings)
+        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), hold_active)
         return it._replace(
             direction=solution.x._replace(u=change),
             contact=problem.follow(it.points, change, state, laws),
@@ -208,7 +207,7 @@ def solve_increment(
     )
     end = jax.lax.while_loop(lambda it: ~it.finished, step, first)
     return IncrementResult(
-        state=problem.advance(end.x, fraction, state, held, end.forces, end.points),
+        state=problem.advance(end.x, fraction, state, hold_active, end.forces, end.points),
         converged=end.size <= end.tolerance,
         steps=end.steps,
         krylov=end.krylov,
@@ -221,17 +220,16 @@ def solve_tangent(
     problem: AbstractProblem,
     tangent: AbstractTangent,
     b: Unknowns,
-    held: Array,
+    hold_active: Array,
     settings: Newton,
     from_left: bool = False,
     preconditioned: Unknowns | None = None,
 ) -> KrylovResult:
-    """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
+    """Solve one linear system with the tangent on free unknowns, without the rigid motions of the active hold.
 
-    In float32, like the tangent. Preconditioned from the left, the Krylov space of a transposed one is, too,
-    that of the preconditioned tangent, or its transpose. From the right it would hold moves that press on stiff
-    contact, for which the friction of a transposed tangent is a large force. Where the preconditioned scaled b is
-    known, it is not computed again.
+    In float32, like the tangent. Left preconditioning gives a transposed system the Krylov space of the preconditioned
+    tangent. Right preconditioning would include displacements that compress stiff contact, for which the friction of a
+    transposed tangent is a large force. A known preconditioned, scaled b is not computed again.
     """
     scale = problem.stress_scale
     b = b.scaled(scale)
@@ -240,13 +238,13 @@ def solve_tangent(
     b = jax.tree.map(lambda part: (part / size).astype(jnp.float32), b)
 
     def inside(x: Unknowns) -> Unknowns:
-        return x._replace(u=problem.project(x.u, held))
+        return x._replace(u=problem.project(x.u, hold_active))
 
     def multiply(v):
         return inside(tangent.apply(v))
 
     def precondition(v):
-        return problem.precondition(tangent, v, held)
+        return problem.precondition(tangent, v, hold_active)
 
     start = b
     if from_left and preconditioned is None:

@@ -1,12 +1,11 @@
-"""Load stepping: increments with cut-back and growth, snaps, and the release of the in-plane hold.
+"""Load stepping: increments with cut-back and growth, snap-through, and release of the in-plane hold.
 
-One `attempt` is one equilibrium sought, accepted or not, as a pure function of its carry; the
-solve loops over it on the host (progress, interruption) or inside a trace.
+One `attempt` is one equilibrium solve, accepted or not, as a pure function of its state. The solve loops over it on
+the host (progress, interruption) or inside a trace.
 
-Where a branch of equilibria ends (a bulging side folds onto the window, an edge slips over a ridge)
-no load increment is small enough: the layer snaps. It is then dragged through a viscous medium to
-the full increment, solve by solve, and the medium is taken away as the motion dies out. Only states
-without viscosity are accepted.
+Snap-through with viscous regularisation: at a limit point (a bulging side folds onto the window, an edge slips over a
+ridge) no load increment is small enough. Viscous forces then stabilise solves at the full increment, and the viscosity
+decreases as the motion decays. Only states without viscosity are accepted.
 """
 
 import functools
@@ -18,15 +17,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..mechanics.staging import apart
+from ..mechanics.unfused import unfused
 from .equations import AbstractProblem, HoldBalance, State
 from .newton import Newton, solve_increment
 from .solution import RESULTS
 from .tangent import Unknowns
 
-# Friction takes over from the hold when it can carry the hold's force with this much to spare.
+# The hold is released when friction can balance its force with this margin.
 _RELEASE_MARGIN = 0.5
-# Without the hold, an increment is cut down to this share of its full size before the hold returns.
+# Without the hold, an increment is cut down to this share of its full size before the hold is restored.
 _LEAST_RELEASED = 0.2
 # Increments cut down to this share of their full size are tried in the viscous medium, unless they
 # are already below the second share.
@@ -41,49 +40,49 @@ _VISCOUS_RTOL = 10.0
 _VISCOUS_STEPS = 12
 # Solves of one snap before it is given up.
 _SNAP_SOLVES = 80
-# Gap of hard contact that counts as none, over the size of an element: 1 nm, as well as the phase of OCT tells; and the
-# share of it that an increment at full load must take away to be followed by another.
+# Tolerance of gaps of hard contact over the size of an element: 1 nm, the resolution of the phase of OCT; and the
+# relative reduction of the gap by an increment at full load that another one must follow.
 _NO_GAP = 1e-5
 _LEAST_SETTLING = 0.5
-# A lateral force below this share of the normal one counts as balanced.
+# A lateral force below this share of the normal one is balanced to round-off.
 _BALANCED = 1e-4
 
 
 class Path(NamedTuple):
-    """The solves that led to a state, one after the other, in arrays of fixed length."""
+    """Load path: equilibrium solves that led to a state, in arrays of fixed length."""
 
     x: Unknowns
     fraction: Float[Array, " n"]
-    held: Bool[Array, " n"]
+    hold_active: Bool[Array, " n"]
     viscosity: Float[Array, " n"]
 
 
 class Stepping(NamedTuple):
-    """Progress of a solve.
+    """State of the load stepping.
 
     Attributes:
         state: Last converged state.
-        before: The state that its solve started from.
-        origin: The state that the next solve starts from: `state`, or one on its way through a snap.
-        viscosity: Of the medium in the next solve, zero unless the layer snaps [-].
-        speed: Viscosity times the largest move of the last solve in the medium [mm].
+        before: Initial state of its solve.
+        origin: Initial state of the next solve: `state`, or a viscous one during a snap-through.
+        viscosity: Viscosity of the next solve, zero except during a snap-through [-].
+        speed: Viscosity times the largest displacement of the last viscous solve [mm].
         increment: Next load increment [-].
-        snap_solves: Solves of the snap under way.
+        snap_solves: Solves of the current snap-through.
         attempts: Solves tried.
         increments: Increments accepted.
         newton: Newton steps of all increments.
         krylov: Preconditioner applications of all increments.
         residual: Relative residual of the last converged state.
-        can_release: Whether friction could carry what the hold carries.
-        release_failed: Whether a try without the hold failed.
-        slides: Whether the hold carries a lateral force at the last converged state.
+        can_release: Whether friction could balance the hold force.
+        release_failed: Whether an increment without the hold failed.
+        slides: Whether the hold force has a lateral component at the last converged state.
         missed_gap: Gap or penetration of hard contact at the last converged state that more increments can
-            take away [mm].
-        failed: Whether the solve has given up.
-        exhausted: Whether the most increments allowed were tried.
-        path: The solves that led to `origin`, for derivatives; None where none are asked for.
-        length: How many solves of `path` led to `origin`.
-        kept: How many of them led to `state`.
+            reduce [mm].
+        failed: Whether the solve has failed.
+        exhausted: Whether the limit of increments was reached.
+        path: Load path to `origin`, for derivatives; None without derivatives.
+        length: Number of solves of `path` that led to `origin`.
+        kept: Number of them that led to `state`.
     """
 
     state: State
@@ -141,22 +140,22 @@ def begin(state: State, settings: Newton, with_path: bool) -> Stepping:
 
 
 def unfinished(s: Stepping) -> Array:
-    """Tell whether another increment is to be tried."""
-    releasable = s.state.held & s.can_release & ~s.release_failed
+    """Return whether the load stepping continues."""
+    releasable = s.state.hold_active & s.can_release & ~s.release_failed
     return ~s.failed & ((s.state.fraction < 1.0) | releasable | (s.missed_gap > 0))
 
 
 def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping:
-    """Try one load increment, or one solve of a snap; keep it if it converges, else return to the last state."""
+    """Solve one load increment, or one viscous solve of a snap-through; restore the last state if it fails."""
     left = 1.0 - s.state.fraction
     increment = jnp.where(left < 1.01 * s.increment, left, s.increment)
     fraction = s.state.fraction + increment
-    held = (s.state.held & ~(s.can_release & ~s.release_failed)) | s.release_failed
+    hold_active = (s.state.hold_active & ~(s.can_release & ~s.release_failed)) | s.release_failed
     snapping = (s.viscosity > 0) | (s.origin.fraction > s.state.fraction)
     span = s.state.fraction - s.before.fraction
     ahead = jnp.where((span > 0) & ~snapping, increment / jnp.where(span > 0, span, 1.0), 0.0)
     moved = jax.tree.map(jnp.subtract, s.state.unknowns, s.before.unknowns)
-    moved = moved._replace(u=problem.project(moved.u, held))
+    moved = moved._replace(u=problem.project(moved.u, hold_active))
     guess = jax.tree.map(lambda v, d: v + ahead * d, s.origin.unknowns, moved)
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, s.viscosity)
     on_the_way = (_VISCOUS_RTOL * settings.rtol, _VISCOUS_STEPS)
@@ -164,14 +163,14 @@ def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping
         jnp.where(s.viscosity > 0, *both) for both in zip(on_the_way, (settings.rtol, settings.max_steps), strict=True)
     ]
     result = solve_increment(
-        slowed, s.origin, guess, fraction, held, eqx.tree_at(lambda n: [n.rtol, n.max_steps], settings, limits)
+        slowed, s.origin, guess, fraction, hold_active, eqx.tree_at(lambda n: [n.rtol, n.max_steps], settings, limits)
     )
     can_release, slides = _hold_balance(problem.hold_balances(result.forces, result.state))
     missed_gap = problem.missed_gap(s.origin, result.state)
     none = s._replace(state=None, before=None, origin=None, path=None)
     trial = _Trial(
         increment=increment,
-        held=held,
+        hold_active=hold_active,
         snapping=snapping,
         converged=result.converged,
         steps=result.steps,
@@ -179,10 +178,10 @@ def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping
         missed_gap=missed_gap,
         no_gap=_NO_GAP * problem.element_depth,
     )
-    next_s, (accepted, goes_on, moves_on) = apart(_decided, none, trial, settings)
+    next_s, (accepted, goes_on, moves_on) = unfused(_decided, none, trial, settings)
     state, before = _where(accepted, (result.state, s.origin), (s.state, s.before))
     origin = _where(goes_on, _where(trial.converged, result.state, s.origin), state)
-    solved = Path(result.state.unknowns, fraction, held, s.viscosity)
+    solved = Path(result.state.unknowns, fraction, hold_active, s.viscosity)
     return next_s._replace(
         state=state,
         before=before,
@@ -197,10 +196,10 @@ def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping
 
 
 class _Trial(NamedTuple):
-    """What is known of one equilibrium sought: see `Stepping`, `attempt` and `IncrementResult`."""
+    """Outcome of one equilibrium solve: see `Stepping`, `attempt` and `IncrementResult`."""
 
     increment: Array
-    held: Array
+    hold_active: Array
     snapping: Array
     converged: Array
     steps: Array
@@ -210,11 +209,11 @@ class _Trial(NamedTuple):
 
 
 def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tuple[Array, Array, Array]]:
-    """Decide what follows from one equilibrium sought, by numbers alone (`apart`, so that they are computed once).
+    """Decide the next step from the scalars of one equilibrium solve (`unfused`, so that they are computed once).
 
     Returns:
-        `Stepping` but for states and what they are measured by; whether the state is accepted, whether a snap goes on,
-        and whether the path moves on.
+        `Stepping` without states and derived quantities; whether the state is accepted, whether a snap-through
+        continues, and whether the path is extended.
     """
     full = 1.0 / settings.increments
     ok, steps, increment = trial.converged, trial.steps, trial.increment
@@ -226,8 +225,8 @@ def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tu
     going = (viscosity <= _MOST_VISCOSITY) & (s.snap_solves < _SNAP_SOLVES)
     goes_on = begins | (trial.snapping & ~accepted & going)
     lost = ~accepted & ~goes_on
-    # Without the hold and without convergence: cut the increment a few times, then take the hold back.
-    lost_hold = lost & ~trial.held & (increment < _LEAST_RELEASED * full)
+    # Without the hold and without convergence: cut the increment a few times, then restore the hold.
+    lost_hold = lost & ~trial.hold_active & (increment < _LEAST_RELEASED * full)
     cut = jnp.where(lost & ~lost_hold, 0.5 * increment, increment)
     grown = jnp.minimum(1.5 * s.increment, full)
     grown = jnp.where(steps <= settings.max_steps // 2, grown, s.increment)
@@ -256,7 +255,7 @@ def _decided(s: Stepping, trial: _Trial, settings: Newton) -> tuple[Stepping, tu
 
 
 def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:
-    """Write one solve into the path at its end, if it moved on."""
+    """Append one solve to the path, if it is extended."""
 
     def write(slots, value):
         value = jnp.where(moves_on, value, slots[jnp.minimum(s.length, slots.shape[0] - 1)])
@@ -266,7 +265,7 @@ def _recorded(s: Stepping, moves_on: Array, solve: Path) -> Path:
 
 
 def _next_viscosity(s: Stepping, trial: _Trial) -> tuple[Array, Array]:
-    """Thicken the medium after a failed solve of a snap; thin it where the motion dies out."""
+    """Increase the viscosity after a failed viscous solve; decrease it where the motion decays."""
     ok, steps = trial.converged, trial.steps
     speed = s.viscosity * trial.furthest
     dies_out = (speed < s.speed) & (steps <= _VISCOUS_STEPS // 2)
@@ -284,23 +283,23 @@ def _where(condition: Array, new, old):
 
 
 def _furthest(u: PyTree, before: PyTree) -> Array:
-    """Compute the largest move along one axis [mm]."""
+    """Compute the largest displacement along one axis [mm]."""
     moves = jax.tree.map(lambda u, before: jnp.max(jnp.abs(u - before)), u, before)
     return functools.reduce(jnp.maximum, jax.tree.leaves(moves))
 
 
 def _hold_balance(bodies: Sequence[HoldBalance]) -> tuple[Array, Array]:
-    """Tell whether friction could carry what the hold carries of every body, and whether that is more than rounding."""
-    can = [(body.capacity > 0) & (body.carried <= _RELEASE_MARGIN * body.capacity) for body in bodies]
-    slides = [body.carried > _BALANCED * body.normal for body in bodies]
+    """Return whether friction could balance the hold force of every body, and whether that force exceeds round-off."""
+    can = [(body.capacity > 0) & (body.hold <= _RELEASE_MARGIN * body.capacity) for body in bodies]
+    slides = [body.hold > _BALANCED * body.normal for body in bodies]
     return functools.reduce(jnp.logical_and, can), functools.reduce(jnp.logical_or, slides)
 
 
 def outcome(s: Stepping) -> RESULTS:
-    """Name how the solve ended."""
+    """Return the status of the solve."""
     failure = RESULTS.where(s.exhausted, RESULTS.max_increments_reached, RESULTS.increment_too_small)
     failure = RESULTS.where(
         jnp.stack([jnp.all(jnp.isfinite(u)) for u in jax.tree.leaves(s.state.u)]).all(), failure, RESULTS.nonfinite
     )
-    success = RESULTS.where(s.state.held & s.slides, RESULTS.slides_off, RESULTS.successful)
+    success = RESULTS.where(s.state.hold_active & s.slides, RESULTS.slides_off, RESULTS.successful)
     return RESULTS.where(s.state.fraction >= 1.0, success, failure)

@@ -1,4 +1,4 @@
-"""Which displacements are prescribed, and which rigid motions that leaves to friction."""
+"""Supports: prescribed displacements, and the rigid motions that only friction resists."""
 
 from typing import NamedTuple
 
@@ -12,12 +12,12 @@ from .stencil import Nodal
 
 
 class Supports(NamedTuple):
-    """Which displacements are prescribed: static, so that it shapes the compiled solve."""
+    """Kinds of boundary conditions, static: they determine the compiled solve."""
 
     window: str  # "contact", "roller" or "bonded"
     interface: str  # "contact", "traction", "uz" or "bonded"
     sides: tuple[str, str, str, str]
-    spring: bool  # an in-plane spring holds the window face
+    spring: bool  # whether an in-plane spring supports the window face
 
     def free(self, node_shape: tuple[int, ...]) -> np.ndarray:
         """Build the mask of unknowns, 1 where free, `(3, nz+1, ny+1, nx+1)`."""
@@ -46,7 +46,7 @@ class Supports(NamedTuple):
 def drift_modes(positions: Nodal, supports: Supports) -> Float[Array, "modes 2 my mx"] | None:
     """Build orthonormal rigid motions of the window face that no support prevents; None without any.
 
-    Weighted by area: what they measure is the mean in-plane motion of the face.
+    Weights are areas: a projection on them is the mean in-plane motion of the face.
     """
     X = positions[:2, 0]
     area = tributary_area(positions[:, 0])
@@ -65,13 +65,13 @@ def drift_modes(positions: Nodal, supports: Supports) -> Float[Array, "modes 2 m
 def rigid_drift(
     positions: Nodal, face: Float[Array, "2 my mx"], modes: Float[Array, "modes 2 my mx"], supports: Supports
 ) -> Float[Array, "2 mz my mx"]:
-    """Find the rigid in-plane motion of the whole body whose window face moves in the modes as `face` does.
+    """Compute the rigid in-plane motion of the body that has the same modes at the window face as `face`.
 
     Args:
         positions: Reference positions of the nodes [mm].
         face: In-plane displacement of the window face [mm].
-        modes: What `drift_modes` gives.
-        supports: Which displacements are prescribed.
+        modes: Modes of `drift_modes`.
+        supports: The supports.
     """
     x, y = positions[:2] - jnp.mean(positions[:2], axis=(1, 2, 3), keepdims=True)
     one, none = jnp.ones_like(x), jnp.zeros_like(x)
@@ -83,7 +83,7 @@ def rigid_drift(
 
 
 def _solve_small(A: Array, b: Array) -> Array:
-    """Solve for as many unknowns as there are drifts, at most three, without LAPACK: by Cramer's rule."""
+    """Solve a system of at most three unknowns by Cramer's rule, without LAPACK."""
     n = b.shape[0]
     if n == 1:
         return b / A[0]
