@@ -1,4 +1,4 @@
-"""One array of a file, as a listing tells it: what it is, and how to get it. Every format's reader makes them.
+"""One array of a file in a listing: its kind, and how to load it. Every format's reader makes them.
 
 Listing reads no numbers: a neighbour that is huge, damaged or no array costs nothing and spoils nothing.
 """
@@ -13,11 +13,11 @@ import numpy as np
 from ..measurement import MeasurementError
 
 MAX_BYTES = 2**29
-"""Largest array that is read unless told otherwise: 8000 by 8000 pixels in float64, above any OCT system's map."""
+"""Default limit of the size of an array: 8000 by 8000 pixels in float64, above any OCT system's map."""
 
 
 class Reading(NamedTuple):
-    """What a reader is asked, and where it leaves remarks.
+    """Arguments of a reader, and its remarks.
 
     Attributes:
         path: The file.
@@ -42,7 +42,7 @@ class Entry(NamedTuple):
         shape: Its shape, as the writing program shows it.
         load: Read it.
         fields: List what a struct holds; None for what is no struct.
-        spacing: (dx, dy) between samples [mm], where the file tells it.
+        spacing: (dx, dy) between samples [mm], where the file states it.
     """
 
     kind: str

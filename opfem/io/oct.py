@@ -156,7 +156,7 @@ def write_oct(volume: OctVolume | Spectra, path: str | os.PathLike) -> None:
 
 
 def _form(path: Path) -> str:
-    """Tell the format from the first bytes."""
+    """Detect the format by the first bytes."""
     if path.is_dir():
         return "thorlabs"
     if not path.is_file():

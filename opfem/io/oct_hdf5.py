@@ -26,7 +26,7 @@ def write_hdf5(volume: OctVolume | Spectra, path: Path) -> None:
     in_one_piece = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     in_one_piece.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     in_one_piece.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    # From this version on HDF5 keeps checksums, which tell a damaged file.
+    # From this version on HDF5 stores checksums, which detect a damaged file.
     with h5py.File(path, "w", libver=("v108", "v110")) as file:
         data = file.create_dataset("values", values.shape, kind, chunks=(1, *values.shape[1:]), dcpl=in_one_piece)
         for row in range(values.shape[0]):

@@ -128,7 +128,7 @@ def _place(data: h5py.Dataset, end: int) -> int | None:
 
 
 def _is_short(data: h5py.Dataset, name: str) -> bool:
-    """Tell whether an attribute is there and of fixed length: HDF5 reads damaged texts of variable length for ever."""
+    """Return whether an attribute exists with fixed length: HDF5 reads damaged texts of variable length for ever."""
     if name not in data.attrs:
         return False
     kind = data.attrs.get_id(name)

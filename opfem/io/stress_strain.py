@@ -251,10 +251,10 @@ def _array_series(entries: dict[str, Entry], columns: tuple[Column, ...]) -> tup
     """Take the columns of the only array of numbers."""
     tables = {name: entry for name, entry in entries.items() if entry.kind == "numbers" and len(entry.shape) == 2}
     if len(tables) != 1:
-        held = ", ".join(f"{name or 'array'} {entry.shape}" for name, entry in entries.items())
+        listed = ", ".join(f"{name or 'array'} {entry.shape}" for name, entry in entries.items())
         raise MeasurementError(
             f"holds no strain and stress by name, and {len(tables)} arrays of columns; pass variable= or columns= to "
-            f"name them. It holds {held or 'nothing'}."
+            f"name them. It holds {listed or 'nothing'}."
         )
     numbers = np.asarray(next(iter(tables.values())).load(), float)
     return _taken(numbers, columns, [""] * numbers.shape[1], None)

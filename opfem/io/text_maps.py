@@ -1,6 +1,6 @@
 """The map in a table of text: without header, index and coordinates, or put together from x, y, z triplets.
 
-Coordinates are told from thickness by their equal steps and their range; where both remain possible, or a row or
+Equal steps and the range distinguish coordinates from thickness; where both remain possible, or a row or
 column of nothing at the edge may be a delimiter too many, the given grid decides, or else the file is refused.
 """
 
@@ -227,7 +227,7 @@ def _fits(reading: Reading, x: _Axis, y: _Axis) -> bool:
 
 
 def _check_spans(reading: Reading, x: _Axis | None, y: _Axis | None, shape: tuple[int, ...]) -> None:
-    """Hold coordinates against the given extent."""
+    """Compare coordinates with the given extent."""
     factors = _factors(reading, x, y)
     axis = x or y
     if not factors or axis is None or any(np.allclose(factors, unit, _SAME) for unit in _UNITS):

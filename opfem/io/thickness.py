@@ -80,7 +80,7 @@ def read_thickness(
         extra = [name for name, value in given.items() if value is not None]
         if extra or unit != "mm":
             raise MeasurementError(
-                f"{path}: was written by opfem and knows its own grid; leave out {', '.join(extra) or 'unit'}."
+                f"{path}: was written by opfem and contains its grid; leave out {', '.join(extra) or 'unit'}."
             )
         return guarded(path, lambda: _restore(entries))
     size = _size_of_one(path, unit, scale)
@@ -219,7 +219,7 @@ def _named(entries: dict[str, Entry], variable: str) -> Entry | None:
 
 
 def _choose(path: Path, entries: dict[str, Entry], variable: str | None, notes: list[str]) -> Entry:
-    """Pick the array that is the map: the one asked for, or the only one that can be."""
+    """Pick the array that is the map: the requested one, or the only candidate."""
     odd = "".join(f"; {note}" for note in notes)
     if not entries:
         raise MeasurementError(f"{path}: the file holds no variable{odd}.")
