@@ -93,14 +93,14 @@ class ImposedPressure(eqx.Module):
     height: Float[Array, "points *faces"] | None = None
     stiffness: tuple[Array, Array] | None = None
 
-    def springs(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
+    def foundation_pressure(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
         """Compute the pressure of the foundation [MPa] at heights [mm]; negative in tension."""
         if self.height is None or self.stiffness is None:
             return jnp.zeros_like(z)
         start, end = self.stiffness
         return ((1.0 - fraction) * start + fraction * end) * (z - self.height)
 
-    def bounding(self, fraction: Array, rule: FaceRule, springs: Array | float) -> Float[Array, "points *faces"]:
+    def bounding(self, fraction: Array, rule: FaceRule, foundation: Array | float) -> Float[Array, "points *faces"]:
         """Compute the pressure [MPa] at the points, the foundation's included; tension bounds friction by zero."""
         corners = (1.0 - fraction) * self.start + fraction * self.end
-        return jnp.maximum(contract(quadrature(rule).N, corners) + springs, 0.0)
+        return jnp.maximum(contract(quadrature(rule).N, corners) + foundation, 0.0)

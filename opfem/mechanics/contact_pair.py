@@ -202,16 +202,16 @@ class ContactPair(eqx.Module):
         return share
 
     def _gathered(
-        self, place: Place, springs: Float[Array, "3 3 points faces"], upper: UpperNodes
+        self, place: Place, stiffness: Float[Array, "3 3 points faces"], upper: UpperNodes
     ) -> Float[Array, "4 4 3 3 upper_faces"]:
         """Assemble contact stiffness of points into face matrices of the upper body, bilinear within faces."""
         my, mx = upper.shape[1:]
         cell = patch(mirrored(upper), place).cell
         x, y = jnp.clip(place - cell, 0.0, 1.0)
         weights = jnp.stack([(x if i else 1.0 - x) * (y if j else 1.0 - y) for i, j in CORNERS])
-        each = weights[:, None, None, None] * weights[None, :, None, None] * springs
+        each = weights[:, None, None, None] * weights[None, :, None, None] * stiffness
         index = (cell[1] * (mx - 1) + cell[0]).reshape(-1)
-        whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), springs.dtype)
+        whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), stiffness.dtype)
         return whole.at[..., index].add(each.reshape(4, 4, 3, 3, -1))
 
 

@@ -149,7 +149,7 @@ class ContactFace(eqx.Module):
         imposed = self.imposed
         if imposed is not None:
             z = points.position[2]
-            push, slope = jax.jvp(lambda z: imposed.springs(points.fraction, z), (z,), (jnp.ones_like(z),))
+            push, slope = jax.jvp(lambda z: imposed.foundation_pressure(points.fraction, z), (z,), (jnp.ones_like(z),))
             pressure = imposed.bounding(points.fraction, self.rule, push)
             return pressure, push, jnp.where(pressure > 0, slope, 0.0), slope
         pressure, slope = jax.jvp(law, (clearance,), (jnp.ones_like(clearance),))

@@ -155,7 +155,7 @@ def solve_increment(
         start = (jnp.ones_like(it.size), 0, (it.forces, it.points), jnp.full_like(it.size, jnp.inf), it.tolerance)
         length, _, (forces, points), size, tolerance = jax.lax.while_loop(unusable, shorten, start)
         unsettled = jnp.where(is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
-        hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
+        failed = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
             contact=jax.tree.map(
@@ -166,7 +166,7 @@ def solve_increment(
             size=size,
             tolerance=tolerance,
             unsettled=unsettled,
-            finished=(size <= tolerance) | (it.steps >= settings.max_steps) | hopeless,
+            finished=(size <= tolerance) | (it.steps >= settings.max_steps) | failed,
         )
 
     def find_step(it):

@@ -108,8 +108,8 @@ class _Hashes:
         else:
             raise ValueError(
                 f"{path} is a {type(part).__name__}, whose content op.sweep cannot hash: it could not distinguish a "
-                "finished point from one of another function. Capture arrays, numbers, opfem objects and plain functions, "
-                "create other objects inside the function, or sweep without out=."
+                "finished point from one of another function. Capture arrays, numbers, opfem objects and plain "
+                "functions, create other objects inside the function, or sweep without out=."
             )
 
     def _function(self, path: str, fn: types.FunctionType) -> Iterator[bytes]:
