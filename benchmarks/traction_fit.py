@@ -32,8 +32,8 @@ from jax import monitoring
 from scipy.interpolate import RectBivariateSpline
 
 import opfem as op
-from opfem.inverse.conjugate_gradients import least_squares, plus
 from opfem.inverse.measured_surface import interface_heights
+from opfem.optimise.conjugate_gradients import least_squares, plus
 
 C10, C01, BULK = 2.23e-3, 7.03e-4, 0.11732  # MPa
 NOISE = 2e-3  # mm

@@ -11,6 +11,7 @@ from .decks import (
     read_inp as read_inp,
     write_inp as write_inp,
 )
+from .identification import ParameterFit as ParameterFit, fit_parameters as fit_parameters
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
     FitError as FitError,
@@ -21,12 +22,10 @@ from .inverse import (
     LogNormal as LogNormal,
     Matern as Matern,
     Normal as Normal,
-    ParameterFit as ParameterFit,
     SideBulge as SideBulge,
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
     TractionFit as TractionFit,
-    fit_parameters as fit_parameters,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,
     mesh_error as mesh_error,

@@ -11,7 +11,6 @@ from .observations import (
     ForceReading as ForceReading,
     SideBulge as SideBulge,
 )
-from .parameter_fit import ParameterFit as ParameterFit, fit_parameters as fit_parameters
 from .parameters import LogNormal as LogNormal, Normal as Normal
 from .prior import Matern as Matern, Tikhonov as Tikhonov, TotalVariation as TotalVariation
 from .refit import refitted as refitted

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
+from ..optimise.conjugate_gradients import dot, plus
 from ..solvers import derivative
 from ..solvers.compiling import QuickJit
 from ..solvers.derivative import Handed, Solve
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
 from ..solvers.solve import compiled_attempt, finish, prepare
-from .conjugate_gradients import dot, plus
 from .forward import Linearised, forward_solve, load_mask
 from .objective import Objective
 from .preconditioner import Unknowns

@@ -1,4 +1,10 @@
-"""Pressure estimates without finite elements: small-strain elasticity of a flat layer, and uniaxial compression."""
+"""Linear layer: transfer function of small-strain elasticity, and pressure estimates without finite elements.
+
+u_z(h) = -G(k) p cos(k x) for a pressure p cos(k x) on a layer of thickness h. G gives the linear estimate, and from it
+the preconditioner and the warm start of a fit.
+"""
+
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -9,16 +15,65 @@ from .._types import ScalarLike
 from ..measurement import ThicknessMap
 from ..model import Bonded, Palpation
 from ..model.homogeneous import cauchy_stress
+from ..model.material import AbstractMaterial
 from ..model.plausible import check_against_layer
+from ..optimise.conjugate_gradients import LeastSquares, least_squares
 from ..solvers.compiling import QuickJit
-from .conjugate_gradients import LeastSquares, least_squares
 from .measured_surface import MeasuredSurface, Nodes, noise_std, project_map
-from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes
-from .transfer import Base, poisson_ratio, transfer_function, wave_numbers
+from .prior import AbstractPrior, cosine_transform, from_cosines, on_nodes, wave_numbers
 
+Base = Literal["bonded", "slip"]
+# Beyond this k h the layer is a half-space to round-off; hyperbolic functions would overflow.
+_DEEP = 300.0
+# Below this k h numerator and denominator cancel; G differs from its limit by less than 1e-8.
+_SHALLOW = 1e-4
 # CGLS tolerance of the linear estimate, well below its model error, and limit of iterations.
 _RTOL = 1e-8
 _STEPS = 1000
+
+
+def poisson_ratio(material: AbstractMaterial) -> Array:
+    """Compute Poisson's ratio at small strain [-]; 1/2 for an infinite bulk modulus."""
+    ratio = material.shear / material.bulk
+    return (3.0 - 2.0 * ratio) / (6.0 + 2.0 * ratio)
+
+
+def transfer_function(
+    k: Float[Array, "*modes"],
+    thickness: ScalarLike,
+    shear: ScalarLike,
+    poisson: ScalarLike | Float[Array, "*ratios"],
+    base: Base,
+) -> Array:
+    """Compute G(k) [mm/MPa], indentation per pressure.
+
+    Args:
+        k: Wave numbers [1/mm].
+        thickness: Thickness of the layer [mm].
+        shear: Shear modulus [MPa].
+        poisson: Poisson's ratio [-], 1/2 included.
+        base: Boundary condition of the other face: "bonded", or "slip" without friction.
+
+    Source:
+        Plane-strain elasticity of a layer; for the bonded one Johnson, Contact Mechanics, section 5.8.
+    """
+    x = jnp.clip(k * thickness, _SHALLOW, _DEEP)
+    # Hyperbolic functions divided by exp(2 x).
+    decay = jnp.exp(-4.0 * x)
+    sinh, cosh, one = 0.5 * (1.0 - decay), 0.5 * (1.0 + decay), jnp.exp(-2.0 * x)
+    if base == "bonded":
+        a = 3.0 - 4.0 * poisson
+        above = a * sinh - 2.0 * x * one
+        below = a * cosh + (2.0 * x**2 + 5.0 - 12.0 * poisson + 8.0 * poisson**2) * one
+        shallow = (1.0 - 2.0 * poisson) / (2.0 * (1.0 - poisson))
+    else:
+        above = cosh - one
+        below = sinh + 2.0 * x * one
+        shallow = 0.5 * (1.0 - poisson)
+    moderate = (1.0 - poisson) / x * above / below
+    deep = (1.0 - poisson) / jnp.maximum(k * thickness, _DEEP)
+    per_shear = jnp.where(k * thickness < _SHALLOW, shallow, jnp.where(k * thickness > _DEEP, deep, moderate))
+    return per_shear * thickness / shear
 
 
 class LinearEstimate(eqx.Module):

@@ -14,12 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import Bonded, Palpation
+from ..optimise.conjugate_gradients import dot, plus
 from ..solvers.compiling import QuickJit
-from .conjugate_gradients import dot, plus
 from .linear_layer import response
 from .measured_surface import MeasuredSurface, Nodes
-from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
-from .transfer import wave_numbers
+from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines, wave_numbers
 
 # Tolerance of the inner conjugate gradients: nearly linear, as flexible CG requires; and their limit of iterations.
 _RTOL = 1e-3

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from .._checks import Leaf, check_finite, check_positive, concrete
 from .._types import ScalarLike
-from .transfer import wave_numbers
 
 Nodes = Float[Array, "my mx"]
 Spacing = tuple[ScalarLike, ScalarLike]
@@ -35,6 +34,14 @@ def cosine_transform(values: Nodes) -> Nodes:
 def from_cosines(modes: Nodes) -> Nodes:
     """Sum orthonormal cosines: inverse, and transpose, of `cosine_transform`."""
     return jax.scipy.fft.idctn(modes, norm="ortho")
+
+
+def wave_numbers(shape: tuple[int, ...], spacing: tuple[ScalarLike, ScalarLike]) -> Float[Array, "my mx"]:
+    """Compute the wave number [1/mm] of every mode of a two-dimensional cosine transform on nodes."""
+    (my, mx), (hx, hy) = shape, spacing
+    ky = jnp.pi * jnp.arange(my) / (my * hy)
+    kx = jnp.pi * jnp.arange(mx) / (mx * hx)
+    return jnp.sqrt(ky[:, None] ** 2 + kx**2)
 
 
 class AbstractPrior(eqx.Module):

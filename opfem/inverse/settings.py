@@ -7,8 +7,8 @@ import equinox as eqx
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from .._types import ScalarLike
+from ..optimise.line_search import ParabolicBacktracking
 from ..solvers import Newton
-from .line_search import ParabolicBacktracking
 
 Choice = Literal["given", "discrepancy", "evidence"]
 

@@ -9,20 +9,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from .._checks import as_leaf
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
 from ..model import Contact, Palpation
-from ..solvers import ConvergenceError, Solution
+from ..optimise.conjugate_gradients import QuasiNewtonInverse
+from ..optimise.gauss_newton import GaussNewton, PreconditionedDescent
+from ..solvers import ConvergenceError
 from ..solvers.compiling import QuickJit, compiled_meanwhile
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
-from .conjugate_gradients import QuasiNewtonInverse
+from .discrepancy import next_factor
 from .elastic_foundation import ElasticFoundation, foundation_at_imprint, zero_foundation
-from .gauss_newton import GaussNewton, PreconditionedDescent
-from .hyperparameters import next_factor
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
 from .jacobian import Point, programs
 from .measured_surface import project_map
@@ -34,7 +34,7 @@ from .preconditioner import Unknowns, fit_normal
 from .prior import AbstractPrior, on_nodes
 from .result import FitError, FitStatus, TractionFit
 from .settings import FitSettings
-from .uncertainty import MAX_ITERATIONS, Posterior, number_covariance, pressure_change, resolution
+from .uncertainty import MAX_ITERATIONS, Posterior, number_covariance, pressure_deviations, resolution, root_mean_square
 from .warm_start import from_linear_estimate, from_normal
 
 # Shown on the progress line during compilation.
@@ -327,7 +327,7 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
             cut_short += int(steps) >= MAX_ITERATIONS
             run.bar.show(f"posterior, draw {count + 1} of {draws}", (count + 1) / draws)
     deviations = jnp.stack(deviations)
-    pressures = _pressure_deviations(solutions, deviations, jnp.stack(moves))
+    pressures = pressure_deviations(solutions, deviations, jnp.stack(moves))
     residual = reached.point.heights - objective.surfaces.surface
     points, widths = resolution(reached.posterior, objective)
     solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
@@ -337,8 +337,8 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
 
     return TractionFit(
         solution=one_or_all(solution),
-        pressure_std=one_or_all(_rms(pressures)),
-        normal_std=one_or_all(_rms(deviations)),
+        pressure_std=one_or_all(root_mean_square(pressures)),
+        normal_std=one_or_all(root_mean_square(deviations)),
         chi2=jnp.sum(reached.residuals["maps"] ** 2),
         effective_dof=jnp.mean(jnp.stack(dof)),
         observed=jnp.sum(objective.surfaces.informed),
@@ -364,23 +364,3 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
         },
         result=reached.result,
     )
-
-
-def _pressure_deviations(
-    solutions: list[Solution], deviations: Float[Array, "draws maps my mx"], moves: Float[Array, "draws maps 3 my mx"]
-) -> Float[Array, "draws maps my mx"]:
-    """Convert deviations of the normal traction to those of the pressure on the current area [MPa]."""
-    each = [_changes(s, deviations[:, i], moves[:, i]) for i, s in enumerate(solutions)]
-    return jnp.stack(each, axis=1)
-
-
-@QuickJit
-def _changes(s: Solution, deviations: Float[Array, "draws my mx"], moves: Float[Array, "draws 3 my mx"]) -> Array:
-    def one(change, move):
-        return pressure_change(s.palpation, s.traction, s.displacement[:, -1], change, move)
-
-    return jax.vmap(one)(deviations, moves)
-
-
-def _rms(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:
-    return jnp.sqrt(jnp.mean(deviations**2, axis=0))

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._checks import concrete
 from ..mechanics.face import nodal_area_vector, tributary_area
 from ..model import Palpation
+from ..optimise.conjugate_gradients import LeastSquares, least_squares, plus
+from ..solvers import Solution
 from ..solvers.compiling import QuickJit, is_traced
-from .conjugate_gradients import LeastSquares, least_squares, plus
 from .measured_surface import Nodes
 from .objective import Objective, normal_traction, normal_weights
 from .preconditioner import Unknowns
@@ -157,6 +158,29 @@ def pressure_change(
         return -jnp.sum(direction * (normal * area) * outward, axis=0) / jnp.sum(outward**2, axis=0)
 
     return jax.jvp(pressure, (normal, u), (change, moved))[1]
+
+
+def pressure_deviations(
+    solutions: list[Solution], deviations: Float[Array, "draws maps my mx"], moves: Float[Array, "draws maps 3 my mx"]
+) -> Float[Array, "draws maps my mx"]:
+    """Convert deviations of the normal traction to those of the pressure on the current area [MPa]."""
+    each = [_pressure_changes(s, deviations[:, i], moves[:, i]) for i, s in enumerate(solutions)]
+    return jnp.stack(each, axis=1)
+
+
+@QuickJit
+def _pressure_changes(
+    s: Solution, deviations: Float[Array, "draws my mx"], moves: Float[Array, "draws 3 my mx"]
+) -> Array:
+    def one(change, move):
+        return pressure_change(s.palpation, s.traction, s.displacement[:, -1], change, move)
+
+    return jax.vmap(one)(deviations, moves)
+
+
+def root_mean_square(deviations: Float[Array, "draws maps my mx"]) -> Float[Array, "maps my mx"]:
+    """Compute the root mean square over draws."""
+    return jnp.sqrt(jnp.mean(deviations**2, axis=0))
 
 
 def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.hyperparameters import next_factor
+from opfem.inverse.discrepancy import next_factor
 
 SHAPE, EXTENT = (21, 21), jnp.array([5.0, 5.0])
 

@@ -14,13 +14,13 @@ import pytest
 import opfem as op
 from opfem.inverse.elastic_foundation import foundation_at_imprint, zero_foundation
 from opfem.inverse.forward import Linearised, forward_solve, load_mask
-from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
 from opfem.inverse.inputs import stacked
 from opfem.inverse.measured_surface import _spline_values, interface_heights, project_map
 from opfem.inverse.objective import Objective
 from opfem.inverse.traction_fit import _status
 from opfem.inverse.warm_start import interpolated
 from opfem.mechanics.face import tributary_area
+from opfem.optimise.gauss_newton import GaussNewton, PreconditionedDescent
 from opfem.solvers.derivative import Handed, follow_path
 from opfem.solvers.discretise import discretise
 from opfem.solvers.stepping import attempt, begin, unfinished

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.conjugate_gradients import least_squares
-from opfem.inverse.transfer import poisson_ratio, transfer_function
+from opfem.inverse.linear_layer import poisson_ratio, transfer_function
 from opfem.inverse.uncertainty import Posterior
+from opfem.optimise.conjugate_gradients import least_squares
 
 # A line of 5 mm, periodic, with 128 points; noise of 2 μm; a Gaussian prior of 2 kPa over 0.5 mm.
 LENGTH, POINTS, THICKNESS = 5.0, 128, 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.state_residuals import axial_increment, bulge
+from opfem.identification.state_residuals import axial_increment, bulge
 from tests.experiments import SIDE
 from tests.tolerances import ROUNDOFF
 

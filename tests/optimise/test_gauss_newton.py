@@ -8,8 +8,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from opfem.inverse.conjugate_gradients import QuasiNewtonInverse, Secants, least_squares
-from opfem.inverse.gauss_newton import GaussNewton, PreconditionedDescent
+from opfem.optimise.conjugate_gradients import QuasiNewtonInverse, Secants, least_squares
+from opfem.optimise.gauss_newton import GaussNewton, PreconditionedDescent
 
 
 def test_settles_where_residuals_curve_more_than_gauss_newton_knows():

@@ -15,15 +15,15 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._device import make_room
+from ..inverse.observations import ForceReading, SideBulge
+from ..inverse.parameters import AbstractNumberPrior, Normal, check_parameters, with_numbers
+from ..inverse.result import FitError
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
 from ..model import Load, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.solution import is_failure
 from ..solvers.solve import require_float64
-from .observations import ForceReading, SideBulge
-from .parameters import AbstractNumberPrior, Normal, check_parameters, with_numbers
-from .result import FitError
 from .state_residuals import residual, source_of
 
 SCALE = "scale"

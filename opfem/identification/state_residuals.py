@@ -11,11 +11,11 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float
 
+from ..inverse.measured_surface import interface_heights, noise_std, project_map
+from ..inverse.observations import ForceReading, SideBulge
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
 from ..solvers import Solution
-from .measured_surface import interface_heights, noise_std, project_map
-from .observations import ForceReading, SideBulge
 
 # Fixed-point iterations for the reference position of a spatial point: at 40 % strain they reduce the error to 1e-8.
 _ITERATIONS = 20
