@@ -65,13 +65,13 @@ def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> LoadP
     """
     problem, s = prepare(palpation, load, None, solver, None, False)
     solves: list[Solve] = []
-    while bool(unfinished(s)) and int(s.length) <= solver.max_path:
+    while bool(unfinished(s)) and int(s.path.length) <= solver.max_path:
         before, s = s, compiled_attempt(problem, s, solver)
-        if int(s.length) > int(before.length):
-            solves.append(Solve(before.origin, s.origin, before.viscosity))
+        if int(s.path.length) > int(before.path.length):
+            solves.append(Solve(before.origin, s.origin, before.snap.viscosity))
         else:
-            del solves[int(s.length) :]
-    return LoadPath(palpation, load, problem, s, solves[: int(s.kept)])
+            del solves[int(s.path.length) :]
+    return LoadPath(palpation, load, problem, s, solves[: int(s.path.kept)])
 
 
 def resume(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
@@ -121,9 +121,9 @@ def traced_solve(palpation: Palpation, load: Traction, solver: Newton) -> Traced
     frozen, settings = jax.lax.stop_gradient((problem, solver))
 
     def goes_on(s):
-        return unfinished(s) & (s.length <= settings.max_path)
+        return unfinished(s) & (s.path.length <= settings.max_path)
 
     end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
-    assert end.path is not None
-    _, state = follow_path(problem, start.state, end.path, end.kept, settings)
+    assert end.path.solves is not None
+    _, state = follow_path(problem, start.state, end.path.solves, end.path.kept, settings)
     return TracedState(state.u, end.state.fraction)

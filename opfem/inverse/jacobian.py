@@ -49,7 +49,7 @@ class Point:
         )
         self.residuals, self.heights = _residuals(self._at)
         self.in_equilibrium = bool(jnp.all(self._at.fraction >= 1.0))
-        self.within_max_path = all(int(path.end.kept) <= solver.max_path for path in self.paths)
+        self.within_max_path = all(int(path.end.path.kept) <= solver.max_path for path in self.paths)
 
     def jacobian(self) -> "Jacobian":
         """Linearise the residuals."""
@@ -135,7 +135,7 @@ def programs(objective: Objective, white: Unknowns) -> list[tuple[QuickJit, tupl
     u, reached = jnp.stack([start.state.u] * maps), jnp.stack([start.state.fraction] * maps)
     at = _Evaluated(objective, white, u, reached)
     (residuals, _), (moved, first) = _zeros(_residuals, at), _zeros(_of_problem, at, white, i)
-    solve = Solve(start.origin, start.origin, start.viscosity)
+    solve = Solve(start.origin, start.origin, start.snap.viscosity)
     varies = load_mask(problem)
     return [
         (compiled_attempt, (problem, start, objective.solver)),

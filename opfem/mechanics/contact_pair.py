@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .contact_face import ContactFace
 from .contact_state import ContactIterate, Corners, FacePoints, PointContact, SlipHistory, TangentLaw
 from .face import CORNERS, area_vector, quadrature, size, surface_tangents, to_corners
-from .interaction import ContactFace, positive_part
+from .friction import positive_part
 from .kinematics import contract
 from .smooth_face import BEYOND, Place, continued, mirrored, patch
 

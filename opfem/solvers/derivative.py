@@ -22,9 +22,9 @@ from ..mechanics.boundary import Bodies
 from .compiling import QuickJit
 from .equations import AbstractProblem, State
 from .equilibrium import Forces, Problem
+from .load_path import Recorded
 from .newton import Newton, solve_tangent
 from .stencil import Nodal
-from .stepping import Path
 from .tangent import AbstractTangent, Tangent, Unknowns
 
 # Relative residual of the linear solves, in float64, and the limit of corrections.
@@ -39,7 +39,7 @@ _KEPT_MOST = 1e-2
 
 
 def follow_path(
-    problem: AbstractProblem, start: State, path: Path, length: Array, settings: Newton
+    problem: AbstractProblem, start: State, path: Recorded, length: Array, settings: Newton
 ) -> tuple[State, State]:
     """Repeat recorded solves, differentiably.
 
@@ -50,7 +50,7 @@ def follow_path(
     settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_CORRECTION_RTOL))
     is_known = length <= path.fraction.shape[0]
 
-    def solved(slowed: AbstractProblem, state: State, solve: Path) -> Unknowns:
+    def solved(slowed: AbstractProblem, state: State, solve: Recorded) -> Unknowns:
         def tangent_solve(matvec, b):
             def solver(transposed):
                 def solved(A, c):
@@ -71,7 +71,7 @@ def follow_path(
             tangent_solve,
         )
 
-    def one(states, solve: Path):
+    def one(states, solve: Recorded):
         _, state = states
         slowed = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
         x = solved(slowed, state, solve)

@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike
 from .._checks import concrete
 from ..mechanics.boundary import Bodies, is_side, take
 from ..mechanics.contact_body import ImposedPressure, RigidSurface
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import FaceRule, area_vector, gather_face, node_shares, size, surface_tangents, tributary_area
-from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import ELEMENT_FORMS, layer_body
 from ..model import (
     Bonded,

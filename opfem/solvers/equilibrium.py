@@ -20,8 +20,8 @@ from ..mechanics.contact_state import (
     TangentLaw,
     separate_histories,
 )
-from ..mechanics.interaction import Touch, can_pair, paired
 from ..mechanics.internal import LayerBody
+from ..mechanics.paired_faces import Touch, can_pair, paired
 from .equations import AbstractProblem, HoldBalance, State
 from .multigrid import build_multigrid
 from .stencil import Nodal

@@ -8,9 +8,9 @@ from jaxtyping import Array
 
 from ..mechanics.boundary import Bodies
 from ..mechanics.contact_body import RigidPlate, RigidSurface
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.contact_pair import SOFT, ContactPair
 from ..mechanics.face import FaceRule
-from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import layer_body, typical
 from ..model import AbstractMaterial, BlockMesh, Bonded, Compression, Contact, Experiment, LayerMesh, Roller, Side
 from .equations import State

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..mechanics.contact_body import RigidPatches
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import to_nodes
-from ..mechanics.interaction import ContactFace
 from ..model import HardOverclosure
 
 Face = Float[Array, "my mx"]

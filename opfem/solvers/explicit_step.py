@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..mechanics.contact_body import RigidPatches
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import area_vector, assemble_face, gather_face, size, surface_tangents
 from ..mechanics.inertia import BulkViscosity, stable_increment
-from ..mechanics.interaction import ContactFace
 from ..mechanics.layer_force import LayerForce
 from .equilibrium import Problem
 from .explicit_contact import FaceMotion, Travel, still, touch

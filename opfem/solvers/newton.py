@@ -121,40 +121,65 @@ class _Iterate(NamedTuple):
     finished: Array
 
 
-def solve_increment(
-    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, hold_active: Array, settings: Newton
-) -> IncrementResult:
-    """Find equilibrium at a load fraction, from a converged state and a first guess.
+class _Increment(NamedTuple):
+    """The equations of one load increment: what Newton's method iterates on."""
 
-    Each pass of the loop takes the step of the previous pass and solves for the next: in this order the residual is
-    compiled once.
-    """
+    problem: AbstractProblem
+    state: State
+    fraction: Array
+    hold_active: Array
+    settings: Newton
 
-    def evaluate(x):
-        points = problem.locate(x.u, fraction, state, bends=True)
-        forces = problem.with_contact(problem.own_forces(x, state), points, fraction, state)
-        size = problem.size(problem.residual(forces, hold_active))
+    def evaluate(self, x: Unknowns) -> tuple[tuple[Any, tuple], Array, Array]:
+        """Compute forces and contact points at x; the residual's size, infinite where an element inverts; tolerance."""
+        problem = self.problem
+        points = problem.locate(x.u, self.fraction, self.state, bends=True)
+        forces = problem.with_contact(problem.own_forces(x, self.state), points, self.fraction, self.state)
+        size = problem.size(problem.residual(forces, self.hold_active))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
-        return (forces, points), size, settings.rtol * problem.force_scale(forces)
+        return (forces, points), size, self.settings.rtol * problem.force_scale(forces)
 
-    def is_settled(size, tolerance):
-        return size < _SETTLED / settings.rtol * tolerance
+    def is_settled(self, size: Array, tolerance: Array) -> Array:
+        """Return whether pressures have converged far enough for curvature in the tangent."""
+        return size < _SETTLED / self.settings.rtol * tolerance
 
-    def take_step(it):
+    def begin(self, guess: Unknowns) -> _Iterate:
+        """Initialise the iteration, without an evaluation."""
+        x = guess._replace(u=self.problem.with_imposed(guess.u, self.fraction))
+        zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, self.fraction.dtype)
+        forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(self.evaluate, x)[0])
+        return _Iterate(
+            x=x,
+            direction=jax.tree.map(jnp.zeros_like, x),
+            contact=self.problem.initial_iterates(self.state),
+            forces=forces,
+            points=points,
+            size=far,
+            tolerance=far,
+            steps=zero,
+            krylov=zero,
+            unsolved=zero,
+            unsettled=zero,
+            finished=jnp.asarray(False),
+        )
+
+    def take_step(self, it: _Iterate) -> _Iterate:
+        """Take the step, halved until no element inverts, and evaluate the residual there."""
+
         def moved(length):
             return jax.tree.map(lambda v, d: v + length * d, it.x, it.direction)
 
         def shorten(carry):
             length, count, *_ = carry
             length = jnp.where(count == 0, 1.0, 0.5 * length)
-            return length, count + 1, *evaluate(moved(length))
+            return length, count + 1, *self.evaluate(moved(length))
 
-        def unusable(carry):
-            return ~jnp.isfinite(carry[3]) & (carry[1] <= settings.max_backtracks)
+        def inadmissible(carry):
+            return ~jnp.isfinite(carry[3]) & (carry[1] <= self.settings.max_backtracks)
 
         start = (jnp.ones_like(it.size), 0, (it.forces, it.points), jnp.full_like(it.size, jnp.inf), it.tolerance)
-        length, _, (forces, points), size, tolerance = jax.lax.while_loop(unusable, shorten, start)
-        unsettled = jnp.where(is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
+        length, _, (forces, points), size, tolerance = jax.lax.while_loop(inadmissible, shorten, start)
+        unsettled = jnp.where(self.is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
         failed = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
@@ -166,16 +191,19 @@ def solve_increment(
             size=size,
             tolerance=tolerance,
             unsettled=unsettled,
-            finished=(size <= tolerance) | (it.steps >= settings.max_steps) | failed,
+            finished=(size <= tolerance) | (it.steps >= self.settings.max_steps) | failed,
         )
 
-    def find_step(it):
-        curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
+    def find_step(self, it: _Iterate) -> _Iterate:
+        """Linearise contact, assemble the tangent and solve for the next step."""
+        problem, state, settings = self.problem, self.state, self.settings
+        curvature = jnp.where(self.is_settled(it.size, it.tolerance), 1.0, 0.0)
         laws = problem.tangent_laws(it.points, state, it.contact, curvature)
-        r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), hold_active)
-        tangent = problem.tangent(it.x, fraction, state, laws, points=it.points)
-        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), hold_active, settings)
-        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), hold_active)
+        forces = problem.with_contact(it.forces, it.points, self.fraction, state, laws)
+        r = problem.residual(forces, self.hold_active)
+        tangent = problem.tangent(it.x, self.fraction, state, laws, points=it.points)
+        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), self.hold_active, settings)
+        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), self.hold_active)
         return it._replace(
             direction=solution.x._replace(u=change),
             contact=problem.follow(it.points, change, state, laws),
@@ -184,28 +212,18 @@ def solve_increment(
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),
         )
 
-    def step(it):
-        it = take_step(it)
-        return jax.lax.cond(it.finished, lambda it: it, find_step, it)
+    def iterate(self, it: _Iterate) -> _Iterate:
+        """Take the step of the previous pass and solve for the next: in this order the residual is compiled once."""
+        it = self.take_step(it)
+        return jax.lax.cond(it.finished, lambda it: it, self.find_step, it)
 
-    x = guess._replace(u=problem.with_imposed(guess.u, fraction))
-    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, fraction.dtype)
-    forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(evaluate, x)[0])
-    first = _Iterate(
-        x=x,
-        direction=jax.tree.map(jnp.zeros_like, x),
-        contact=problem.initial_iterates(state),
-        forces=forces,
-        points=points,
-        size=far,
-        tolerance=far,
-        steps=zero,
-        krylov=zero,
-        unsolved=zero,
-        unsettled=zero,
-        finished=jnp.asarray(False),
-    )
-    end = jax.lax.while_loop(lambda it: ~it.finished, step, first)
+
+def solve_increment(
+    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, hold_active: Array, settings: Newton
+) -> IncrementResult:
+    """Find equilibrium at a load fraction, from a converged state and an initial guess."""
+    increment = _Increment(problem, state, fraction, hold_active, settings)
+    end = jax.lax.while_loop(lambda it: ~it.finished, increment.iterate, increment.begin(guess))
     return IncrementResult(
         state=problem.advance(end.x, fraction, state, hold_active, end.forces, end.points),
         converged=end.size <= end.tolerance,

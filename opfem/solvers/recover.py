@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
 from ..mechanics.boundary import Bodies, Body, Touching, put, take, to_touching
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.contact_state import PointContact
 from ..mechanics.face import (
     area_vector,
@@ -19,7 +20,6 @@ from ..mechanics.face import (
     to_corners,
     tributary_area,
 )
-from ..mechanics.interaction import ContactFace
 from ..mechanics.interface_point import NodalField, locate
 from ..model import Compression, Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State

@@ -149,7 +149,7 @@ def prepare(palpation, load, load_start, solver, state: State | None, traced: bo
     if state is None:
         stepping = begin(initial, solver, traced)
         if isinstance(palpation, Experiment):
-            stepping = stepping._replace(before=touching(problem, initial, stepping.increment))
+            stepping = stepping._replace(before=touching(problem, initial, stepping.increments.size))
         return problem, stepping
     if jax.tree.structure(state) != jax.tree.structure(initial):
         raise ValueError(
@@ -169,7 +169,7 @@ _compiled_follow_path = QuickJit(follow_path)
 def _run_with_progress(problem: AbstractProblem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     while bool(unfinished(stepping)):
         stepping = compiled_attempt(problem, stepping, solver)
-        fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.viscosity > 0) else ""
+        fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.snap.viscosity > 0) else ""
         bar.show(f"load {100 * fraction:.0f} %, {int(stepping.newton)} Newton steps{snaps}", fraction, estimate=True)
     return stepping
 
@@ -180,9 +180,9 @@ def _run_differentiable(problem: AbstractProblem, stepping: Stepping, solver: Ne
         end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
     else:  # differentiated, but not part of a larger program
         end = _run_with_progress(frozen, start, settings, bar)
-    assert end.path is not None
-    before, state = _compiled_follow_path(problem, stepping.state, end.path, end.kept, settings)
-    return end._replace(before=before, state=state, path=None)
+    assert end.path.solves is not None
+    before, state = _compiled_follow_path(problem, stepping.state, end.path.solves, end.path.kept, settings)
+    return end._replace(before=before, state=state, path=end.path._replace(solves=None))
 
 
 def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> tuple[AbstractProblem, Stepping]:
@@ -192,21 +192,24 @@ def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> t
         shifted = eqx.tree_at(lambda p: p.contacts.sample.offset, problem, offset)
         # The surface moves by the approach only: one increment at the full load.
         again = begin(stepping.state, solver, run is _run_differentiable)
-        state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)
+        state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increments.size)
         again = again._replace(
             state=state,
             before=state,
             origin=state,
-            can_release=stepping.can_release,
-            release_failed=stepping.release_failed,
+            hold=again.hold._replace(can_release=stepping.hold.can_release, failed=stepping.hold.failed),
         )
-        stepping_next = run(shifted, again, solver, bar)
-        totals = {
-            name: getattr(stepping, name) + getattr(stepping_next, name)
-            for name in ("attempts", "increments", "newton", "krylov")
-        }
-        problem, stepping = shifted, stepping_next._replace(**totals)
+        problem, stepping = shifted, _with_work_of(stepping, run(shifted, again, solver, bar))
     return problem, stepping
+
+
+def _with_work_of(first: Stepping, second: Stepping) -> Stepping:
+    """Add the counts of a first solve to those of a second one."""
+    counts = second.increments._replace(
+        attempts=first.increments.attempts + second.increments.attempts,
+        accepted=first.increments.accepted + second.increments.accepted,
+    )
+    return second._replace(increments=counts, newton=first.newton + second.newton, krylov=first.krylov + second.krylov)
 
 
 @QuickJit
@@ -221,8 +224,8 @@ def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
     counts = {
         "newton_steps": s.newton,
         "krylov_steps": s.krylov,
-        "increments": s.increments,
-        "attempts": s.attempts,
+        "increments": s.increments.accepted,
+        "attempts": s.increments.attempts,
         "residual": s.residual,
         "load_fraction": s.state.fraction,
     }

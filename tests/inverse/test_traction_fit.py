@@ -170,7 +170,7 @@ def test_jacobian_of_the_fit_against_exact_derivatives(load):
         end = jax.lax.while_loop(
             unfinished, lambda s: attempt(frozen, s, settings), begin(frozen.initial_state(), settings, True)
         )
-        return follow_path(problem, problem.initial_state(), end.path, end.kept, settings)[1].u[:, -1]
+        return follow_path(problem, problem.initial_state(), end.path.solves, end.path.kept, settings)[1].u[:, -1]
 
     path = forward_solve(experiment, load(field), settings)
     line = Linearised.along(path, settings)

@@ -1,12 +1,11 @@
-"""Contact and friction of faces of the layer with a rigid surface, at their face points.
+"""Contact of faces of the layer with a rigid surface, integrated at their face points.
 
 Pressure follows the overclosure law along the surface's true normal, on the current area. Friction is Coulomb's, with
 elastic slip and a return map. The slip of a point is measured along the surface, in (x, y) of the surface, with a
 history over the increments.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -15,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..model import Contact
-from .boundary import Bodies
 from .contact_body import ImposedPressure, RigidPlate, RigidSurface
 from .contact_state import (
     ContactIterate,
@@ -25,15 +23,12 @@ from .contact_state import (
     PointVector,
     SlipHistory,
     TangentLaw,
-    joined_histories,
 )
 from .face import FaceRule, area_vector, quadrature, size, surface_tangents, to_corners
+from .friction import Friction, positive_part, return_map, trial_slip
 from .kinematics import contract
-from .paired_contact import PairedContact, PairedSurface, split
+from .paired_contact import PairedContact, PairedSurface
 from .unfused import unfused
-
-# Share of the elastic limit from which on the status of a point is "slip".
-_AT_LIMIT = 0.9
 
 
 class ContactFace(eqx.Module):
@@ -166,7 +161,7 @@ class ContactFace(eqx.Module):
 
         A newly closed point has the pressure of the law, bounded by that which shortens an element by a thousandth.
         """
-        sticks = jnp.sum(_trial(points, history) * iterate.direction, axis=0) < 0
+        sticks = jnp.sum(trial_slip(points, history) * iterate.direction, axis=0) < 0
         clearance = self.clearance(points)
         most = 1e-3 * self.stiffness * self.element_size
         law = self.own_law(history)
@@ -195,33 +190,9 @@ class ContactFace(eqx.Module):
         """Compute the derivative of the clearance by the points' positions [-], with a share of the curvature."""
         return points.normal * -self._side(clearance) - clearance / points.stretch * _stretch_slope(points, curvature)
 
-    def friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks) -> "Friction":
+    def friction(self, pressure: Array, points: FacePoints, history: SlipHistory, sticks: Array | None) -> Friction:
         """Compute Coulomb friction at face points; points in `sticks` stick."""
-        trial, (slope_x, slope_y) = _trial(points, history), points.slope
-        rise = slope_x * trial[0] + slope_y * trial[1]
-        squared = trial[0] ** 2 + trial[1] ** 2 + rise**2
-        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        length = jnp.where(squared > 0, length, 0.0)
-        limit = self.contact.slip_limit(pressure, self.element_size)
-        sliding = length > limit if sticks is None else (length > limit) & ~sticks
-        ratio = jnp.where(sliding, limit / jnp.where(sliding, length, 1.0), 1.0)
-        closed = pressure > 0
-        elastic = jnp.where(closed, ratio * trial, 0.0)
-        stiffness = self.contact.stick_stiffness(pressure, self.element_size)
-        climb = slope_x * elastic[0] + slope_y * elastic[1]
-        tangent = jnp.concatenate([elastic, climb[None]])
-        return Friction(
-            traction=-stiffness * tangent,
-            stiffness=stiffness * ratio,
-            reach=jnp.concatenate([trial, rise[None]]),
-            length=length,
-            elastic=elastic,
-            slid=jnp.where(closed, trial - elastic, 0.0),
-            conjugate=-stiffness * (elastic + points.slope * climb),
-            limited=sliding,
-            sliding=closed & sliding,
-            slips=closed & (length > _AT_LIMIT * limit),
-        )
+        return return_map(pressure, self._stick(pressure), self._limit(pressure), points, history, sticks)
 
     def _linearised(
         self, points: FacePoints, history: SlipHistory, law: TangentLaw | None
@@ -321,90 +292,8 @@ class ContactFace(eqx.Module):
         return SlipHistory(points.position[:2], point.elastic, history.slip + point.slid, dissipated, point.pressure)
 
 
-def positive_part(
-    normal: PointVector, pushing: Array, sticking: Array, friction: "Friction"
-) -> Float[Array, "3 3 points *faces"]:
-    """Compute the symmetric positive part of contact's stiffness [MPa/mm]: without curvature and frictional coupling.
-
-    Args:
-        normal: Normal of the surface.
-        pushing: Normal stiffness.
-        sticking: Tangential stiffness, of sliding points across their slip only.
-        friction: Friction at the points.
-    """
-    along, eye = normal[:, None] * normal, np.eye(3).reshape(3, 3, *[1] * (normal.ndim - 1))
-    length = jnp.where(friction.limited, friction.length, 1.0)
-    direction = jnp.where(friction.limited, friction.reach / length, 0.0)
-    return pushing * along + sticking * (eye - along - direction[:, None] * direction)
-
-
-def _trial(points: FacePoints, history: SlipHistory) -> Float[Array, "2 points *faces"]:
-    """Compute the trial elastic slip [mm], for stick at all points."""
-    anchor = history.position if points.anchor is None else points.anchor
-    return history.elastic + points.position[:2] - anchor
-
-
 def _stretch_slope(points: FacePoints, curvature: Array | float) -> PointVector:
     """Compute the derivative of the surface's stretch by position [1/mm], with a share of the curvature."""
     assert points.bend is not None
     along = points.slope[0] * points.bend[0] + points.slope[1] * points.bend[1]
     return jnp.concatenate([curvature * along / points.stretch, jnp.zeros_like(along[:1])])
-
-
-class Touch(NamedTuple):
-    """Contact faces that are evaluated together, and the bodies they belong to."""
-
-    names: tuple[str, ...]
-    face: ContactFace
-
-    def history(self, histories: Bodies) -> SlipHistory:
-        """Concatenate the friction histories of the bodies."""
-        return joined_histories([getattr(histories, name) for name in self.names])
-
-    def split(self, values: Any) -> dict[str, Any]:
-        """Split values of all faces into those of each body."""
-        return dict(zip(self.names, split(values, len(self.names)), strict=True))
-
-
-def paired(faces: Sequence[ContactFace]) -> ContactFace:
-    """Combine several contact faces into one (`can_pair`)."""
-    first, count = faces[0], len(faces)
-    if count == 1:
-        return first
-
-    def side_by_side(values):
-        return None if values[0] is None else jnp.concatenate(values, axis=-1)
-
-    return ContactFace(
-        contact=PairedContact(tuple(face.own_contact for face in faces)),
-        surface=PairedSurface(tuple(face.surface for face in faces)),
-        offset=jnp.stack([face.offset for face in faces]),
-        imposed=None,
-        element_size=first.element_size,
-        stiffness=first.stiffness,
-        above=tuple(bool(face.above) for face in faces),
-        rule=first.rule,
-        sides=side_by_side([face.sides for face in faces]),
-        shares=side_by_side([face.shares for face in faces]),
-    )
-
-
-def can_pair(faces: Sequence[ContactFace]) -> bool:
-    """Return whether contact faces have the same quadrature, so that they can be evaluated together."""
-    alike = {(face.rule, face.sides is None) for face in faces}
-    return len(alike) == 1 and all(face.imposed is None for face in faces)
-
-
-class Friction(NamedTuple):
-    """Friction at face points: traction [MPa], and the quantities that its derivatives need."""
-
-    traction: Array
-    stiffness: Array  # tangential stiffness [MPa/mm], of stick or slip
-    reach: Array  # trial elastic slip, in space [mm]
-    length: Array  # of it [mm]
-    elastic: Array
-    slid: Array
-    conjugate: Array
-    limited: Array  # whether friction, if any, is at its limit
-    sliding: Array
-    slips: Array

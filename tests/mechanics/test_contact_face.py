@@ -10,9 +10,9 @@ import pytest
 
 import opfem as op
 from opfem.mechanics.contact_body import ImposedPressure, RigidSurface
+from opfem.mechanics.contact_face import ContactFace
 from opfem.mechanics.contact_state import ContactIterate, TangentLaw
 from opfem.mechanics.face import assemble_face, gather_face, quadrature
-from opfem.mechanics.interaction import ContactFace
 from opfem.model import height_field
 from tests.oracles import assemble_dense_face
 from tests.tolerances import FINITE_DIFFERENCE, ROUNDOFF
