@@ -31,8 +31,8 @@ class TracedState(NamedTuple):
     fraction: Array
 
 
-class LoadPath(NamedTuple):
-    """Load path of the layer under a traction.
+class ForwardSolve(NamedTuple):
+    """Forward solve of the layer under a traction.
 
     Attributes:
         palpation: The experiment.
@@ -53,7 +53,7 @@ class LoadPath(NamedTuple):
         return judged(finish(self.problem, resume(self.problem, self.end, solver), self.palpation, self.load))
 
 
-def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> LoadPath:
+def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> ForwardSolve:
     """Solve under a traction, increment by increment, by the program that all solves of this mesh share.
 
     It stops where the path is longer than `Newton.max_path`, solves of a snap-through included.
@@ -71,7 +71,7 @@ def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> LoadP
             solves.append(Solve(before.origin, s.origin, before.snap.viscosity))
         else:
             del solves[int(s.path.length) :]
-    return LoadPath(palpation, load, problem, s, solves[: int(s.path.kept)])
+    return ForwardSolve(palpation, load, problem, s, solves[: int(s.path.kept)])
 
 
 def resume(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
@@ -95,7 +95,7 @@ class Linearised(eqx.Module):
     solver: Newton
 
     @classmethod
-    def along(cls, path: LoadPath, solver: Newton) -> "Linearised":
+    def along(cls, path: ForwardSolve, solver: Newton) -> "Linearised":
         """Linearise the solves of a load path."""
         return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in path.solves], solver)
 

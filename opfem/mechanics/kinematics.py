@@ -1,8 +1,8 @@
 """Cells and their quadrature points: geometry, gradients, forces and matrices of the layer.
 
 A cell is the support of one set of shape functions: an element, or for tetrahedra the box of six of them. A cell's map
-is X = hx (i + ξ), Y = hy (j + η), with columns of nodes that stand upright, so its inverse gradient has five entries,
-all known in closed form.
+is X = hx (i + ξ), Y = hy (j + η), with upright columns of nodes. Its inverse gradient has five entries, all in closed
+form.
 """
 
 import functools

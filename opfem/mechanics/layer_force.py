@@ -1,8 +1,8 @@
 """Internal force of a layer of hexahedra by sum-factorised gradients: the inner loop of explicit dynamics.
 
 The same forces as `SolidBody` gives for `full` and `mean_dilatation` and a law in the invariants, several times
-faster: a field is interpolated one axis at a time, Gauss points are leading axes (qz, qy, qx), x is innermost, and
-stress is a closed form of the displacement gradient, so that float32 keeps its digits at small strain.
+faster. A field is interpolated one axis at a time; Gauss points are leading axes (qz, qy, qx), x is innermost. Stress
+is a closed form of the displacement gradient, so that float32 does not lose digits at small strain.
 """
 
 from collections.abc import Callable

@@ -21,9 +21,9 @@ from .plausible import check_clearance_unit, check_modulus_unit
 _LINEAR_BEYOND = 6.0
 # Newton steps from an initial value within a factor of two; they converge to round-off.
 _INVERSE_STEPS = 8
-# Penalty over element stiffness, with the method of multipliers and without. A layer off whose window
-# two corners lift (50×50×4 elements) takes 11, 13, 13, 15, 15 and 38 increments at 3, 5, 10, 15, 20 and 30, and fails
-# at 1000; the coin on 40×40×4 elements takes 84, 79, 74, 74, 74 and 74 Newton steps. Of 200 random problems 199
+# Penalty over element stiffness, with the method of multipliers and without. Ratios 3, 5, 10, 15, 20 and
+# 30: a layer with two lifted corners (50×50×4 elements) takes 11, 13, 13, 15, 15 and 38 increments, and fails at 1000;
+# the coin on 40×40×4 elements takes 84, 79, 74, 74, 74 and 74 Newton steps. Of 200 random problems 199
 # converge at 3 and 5, and 198 at 10 (`benchmarks/robustness.py`).
 _EXACT_RATIO, _PENALTY_RATIO = 5.0, 1000.0
 

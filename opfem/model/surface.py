@@ -90,7 +90,7 @@ class Patches(eqx.Module):
     """The surface around points, each with the polynomial of its grid cell.
 
     Outside of its cell a point has the value of the continued polynomial: accurate to third order in the distance
-    (second for "catmull-rom", first for "bilinear"), so that patches serve while points move by a small part of a cell.
+    (second for "catmull-rom", first for "bilinear"). Patches serve while points move by a small part of a cell.
 
     Attributes:
         field: The surface.

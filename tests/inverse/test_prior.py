@@ -117,3 +117,19 @@ def test_total_variation_sees_a_checkerboard():
     field = 1e-4 * (-1.0) ** (rows + columns)
     slopes, _ = prior.residual(prior.whiten(jnp.asarray(field), SPACING), SPACING)
     assert jnp.min(jnp.sum(slopes**2, axis=(0, 1))) > 0
+
+
+@pytest.mark.parametrize("prior", [op.Matern(0.7, 2e-3), op.Tikhonov(1, 300.0), op.TotalVariation(30.0, 2e-3)])
+def test_log_normaliser_is_half_the_log_determinant_of_the_covariance(prior):
+    shape, spacing = (5, 6), (0.2, 0.3)
+    root = jax.vmap(lambda white: prior.expand(white, spacing).ravel())(jnp.eye(30).reshape(30, *shape))
+    sign, log_determinant = np.linalg.slogdet(np.asarray(root.T @ root))
+    assert sign > 0
+    assert prior.log_normaliser(shape, spacing) == pytest.approx(0.5 * log_determinant, rel=1e-10)
+
+
+def test_length_below_an_element_is_refused():
+    with pytest.raises(ValueError, match=r"Matern.length \[mm\] must be at least an element, 0.3, got 0.25"):
+        op.Matern(0.25, 2e-3).check_resolved((0.2, 0.3))
+    op.Matern(0.35, 2e-3).check_resolved((0.2, 0.3))
+    op.Tikhonov(1, 300.0).check_resolved((0.2, 0.3))
