@@ -21,7 +21,7 @@ from .line_search import ParabolicBacktracking, SearchState
 # Largest CG tolerance, far from the optimum.
 _LARGEST_RTOL = 0.03
 # A Gauss–Newton direction changes the residuals by at most their norm; 1 % for inexact products. Secants without
-# the restart predicted up to 11 times that. Fits of friction and C10 take 13 to 29 forward solves with it, else 24 to 69.
+# the restart predicted up to 11 times that. Fits of friction and C10 take 13 to 29 forward solves, not 24 to 69.
 _LARGEST_CHANGE = 1.01
 # BFGS pairs kept from steps, and from CG iterations: as many as one system takes at most.
 _STEP_PAIRS = 20
