@@ -31,7 +31,8 @@ from ..model import (
 )
 from ..model.plausible import check_against_layer, check_approach
 from .equilibrium import Problem
-from .supports import Supports, drift_modes
+from .in_plane_hold import drift_modes
+from .supports import Supports
 from .tangent import VOLUME_GUARD
 
 

@@ -5,13 +5,14 @@ Displacements are PyTrees: an array of nodes, or a tuple of them, one for each b
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .in_plane_hold import HoldBalance
 from .tangent import AbstractTangent, Unknowns
 
 
@@ -41,14 +42,6 @@ class State(eqx.Module):
     def unknowns(self) -> Unknowns:
         """What Newton's method solves for."""
         return Unknowns(self.u, self.mean_stress)
-
-
-class HoldBalance(NamedTuple):
-    """In-plane hold force of one body, the friction that could replace it, and the normal force [N]."""
-
-    hold: Array
-    capacity: Array
-    normal: Array
 
 
 class AbstractProblem(eqx.Module):

@@ -22,10 +22,11 @@ from ..mechanics.contact_state import (
 )
 from ..mechanics.internal import LayerBody
 from ..mechanics.paired_faces import Touch, can_pair, paired
-from .equations import AbstractProblem, HoldBalance, State
+from .equations import AbstractProblem, State
+from .in_plane_hold import HoldBalance, lateral_size, rigid_part, without_drift, without_rigid_part
 from .multigrid import build_multigrid
 from .stencil import Nodal
-from .supports import Supports, rigid_drift
+from .supports import Supports
 from .tangent import Tangent, Unknowns, couple_volume
 
 
@@ -197,26 +198,13 @@ class Problem(AbstractProblem):
         floor = 1e-3 * self.body.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(contact + floor**2)
 
-    def _rigid_part(self, face: Float[Array, "2 my mx"]) -> Float[Array, "2 my mx"]:
-        """Compute the rigid part of in-plane nodal values at the window."""
-        if self.drift_modes is None:
-            return jnp.zeros_like(face)
-        modes = self.drift_modes.astype(face.dtype)
-        return jnp.tensordot(jnp.tensordot(modes, face, 3), modes, 1)
-
     def project(self, r: Nodal, hold_active: Array) -> Nodal:
         """Project the rigid motions of the active hold out of a nodal field."""
-        if self.drift_modes is None:
-            return r
-        face = r[:2, 0] - jnp.where(hold_active, self._rigid_part(r[:2, 0]), 0.0)
-        return jax.lax.dynamic_update_slice(r, face[:, None], (0, 0, 0, 0))
+        return without_rigid_part(self.drift_modes, r, hold_active)
 
     def without_drift(self, u: Nodal, hold_active: Array) -> Nodal:
         """Translate and rotate the body until its window face has no rigid motion of the active hold."""
-        if self.drift_modes is None:
-            return u
-        drift = rigid_drift(self.positions, u[:2, 0], self.drift_modes, self.supports)
-        return jnp.concatenate([u[:2] - jnp.where(hold_active, drift, 0.0), u[2:]])
+        return without_drift(self.positions, self.drift_modes, self.supports, u, hold_active)
 
     def limited(self, change: Nodal, step_limit: float | int | Array) -> Nodal:
         """Limit the outliers of a step: displacements of single nodes."""
@@ -229,18 +217,13 @@ class Problem(AbstractProblem):
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
         if forces.spring is not None:
             return forces.spring
-        return jnp.where(hold_active, self._rigid_part((jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]), 0.0)
+        face = (jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]
+        return jnp.where(hold_active, rigid_part(self.drift_modes, face), 0.0)
 
     def hold_balances(self, forces: Forces, state: State) -> tuple[HoldBalance]:
         """Compute the hold force, the friction that could replace it, and the normal force."""
         forces = self.reactions(forces)
-        hold = self.hold_force(forces, state.hold_active)
-        X = self.positions[:2, 0]
-        arm = X - jnp.mean(X, axis=(1, 2), keepdims=True)
-        radius = jnp.mean(jnp.sqrt(jnp.sum(arm**2, axis=0)))
-        lateral = jnp.sum(hold, axis=(1, 2))
-        moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
-        force = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
+        force = lateral_size(self.positions, self.hold_force(forces, state.hold_active))
         capacity = jnp.zeros((), force.dtype)
         for face, touching in zip(self.contacts, forces.applied, strict=True):
             if face is not None:

@@ -15,8 +15,9 @@ from ..mechanics.internal import layer_body, typical
 from ..model import AbstractMaterial, BlockMesh, Bonded, Compression, Contact, Experiment, LayerMesh, Roller, Side
 from .equations import State
 from .equilibrium import Problem
+from .in_plane_hold import drift_modes
 from .stack import Stack
-from .supports import Supports, drift_modes
+from .supports import Supports
 from .tangent import VOLUME_GUARD
 
 # Pressure of every contact at the initial guess, over the lower body's shear modulus: enough for laws of zero initial

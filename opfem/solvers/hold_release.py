@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .equations import HoldBalance
+from .in_plane_hold import HoldBalance
 from .increments import Trial
 
 # The hold is released when friction can balance its force with this margin.

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.boundary import Touching, put, take, to_touching
 from ..mechanics.contact_pair import ContactPair, PairForce
-from .equations import AbstractProblem, HoldBalance, State
+from .equations import AbstractProblem, State
 from .equilibrium import Forces, Problem, single
+from .in_plane_hold import HoldBalance
 from .stencil import Nodal
 from .tangent import Tangent, Unknowns
 
