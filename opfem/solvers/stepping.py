@@ -143,7 +143,7 @@ def _decided(s: Stepping, trial: Trial, settings: Newton) -> tuple[Stepping, tup
         `Stepping` without states and derived quantities; whether the state is accepted, whether a snap-through
         continues, and whether the path is extended.
     """
-    full = 1.0 / settings.increments
+    full = jnp.asarray(1.0 / settings.increments)
     accepted = trial.converged & (s.snap.viscosity == 0)
     snap, snaps = s.snap.next(trial, accepted, full)
     lost = ~accepted & ~snaps
