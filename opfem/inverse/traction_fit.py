@@ -88,49 +88,64 @@ def fit_traction(
         FitError: If the fit fails and `throw` is True.
     """
     settings = settings.changed(**changed)
+    maps = as_tuple(thickness)
     parameters = dict(sorted((parameters or {}).items()))  # the order of every PyTree
-    maps, solver, model_std = as_tuple(thickness), settings.solver, settings.model_std
     if lateral is not None and not isinstance(lateral, AbstractPrior):
         lateral = as_leaf(lateral, "fit_traction.lateral", "MPa")
     inputs = {"palpation": palpation, "thickness": maps, "prior": prior, "parameters": parameters, "lateral": lateral}
-    require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=solver.as_leaves())
+    require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=settings.solver.as_leaves())
     check_inputs(palpation, maps, prior, lateral, parameters, as_tuple(inside))
-    several = not isinstance(thickness, ThicknessMap)
-    known_std = as_leaf(0.0 if model_std is None else model_std, "fit_traction.model_std", "mm")
-    surfaces = _project_maps(palpation.mesh(), *stacked_maps(maps), known_std)
+    readings = stacked("forces", forces, len(maps)), stacked("inside", inside, len(maps))
+    objective = _objective(palpation, maps, prior, parameters, *readings, lateral, settings)
+    with Progress(settings.progress) as bar:
+        bar.stage("imprint", compiles=_COMPILES)
+        run = _Run(objective, settings, bar)
+        given = None if settings.start is None else from_normal(settings.start, objective)
+        with compiled_meanwhile(programs(objective, objective.white(objective.surfaces.surface))):
+            foundation = _foundation(run)
+        reached = _fit_with_fallbacks(run, foundation, given)
+        if settings.model_std is None and not _failed(reached):
+            reached = _with_mesh_error(run, reached, maps)
+        if not _failed(reached) and settings.hyperparameters != "given":
+            reached = _with_chosen_prior(run, reached)
+        if settings.throw and _failed(reached):
+            raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
+        fit = _result(reached, run, several=not isinstance(thickness, ThicknessMap))
+    # The discrepancy principle aims at a χ² above its optimum.
+    judged = bool(fit.result == FitStatus.successful) and settings.hyperparameters != "discrepancy"
+    if judged and fit.reduced_chi2 > 1.0 and fit.advice():
+        warnings.warn(fit.advice(), stacklevel=2)
+    return fit
+
+
+def _objective(
+    palpation: Palpation,
+    maps: tuple[ThicknessMap, ...],
+    prior: AbstractPrior,
+    parameters: dict[str, AbstractNumberPrior],
+    forces: ForceReading | None,
+    inside: AxialDisplacement | None,
+    lateral: AbstractPrior | Array | None,
+    settings: FitSettings,
+) -> Objective:
+    """Project the maps and build the objective under a dead load."""
+    model_std = 0.0 if settings.model_std is None else settings.model_std
+    model_std = as_leaf(model_std, "fit_traction.model_std", "mm")
+    surfaces = _project_maps(palpation.mesh(), *stacked_maps(maps), model_std)
     check_covered(maps, surfaces)
-    objective = Objective(
+    return Objective(
         palpation=palpation,
         surfaces=surfaces,
         prior=prior,
         lateral=lateral if isinstance(lateral, AbstractPrior) else None,
         known_lateral=None if isinstance(lateral, AbstractPrior) else lateral,
         parameters=parameters,
-        forces=stacked("forces", forces, len(maps)),
-        inside=stacked("inside", inside, len(maps)),
+        forces=forces,
+        inside=inside,
         softness=settings.softness * palpation.layer.material.shear if settings.nonnegative else None,
         foundation=zero_foundation(palpation, surfaces, prior),
-        solver=solver.as_leaves(),
+        solver=settings.solver.as_leaves(),
     )
-    with Progress(settings.progress) as bar:
-        bar.stage("imprint", compiles=_COMPILES)
-        run = _Run(objective, settings, bar)
-        given = None if settings.start is None else from_normal(settings.start, objective)
-        with compiled_meanwhile(programs(objective, objective.white(surfaces.surface))):
-            foundation = _foundation(run)
-        reached = _fit_with_fallbacks(run, foundation, given)
-        if model_std is None and not _failed(reached):
-            reached = _with_mesh_error(run, reached, maps)
-        if not _failed(reached) and settings.hyperparameters != "given":
-            reached = _with_chosen_prior(run, reached)
-        if settings.throw and _failed(reached):
-            raise FitError(f"The fit stopped after {run.solves} forward solves. {FitStatus[reached.result]}")
-        fit = _result(reached, run, several)
-    # The discrepancy principle aims at a χ² above its optimum.
-    judged = bool(fit.result == FitStatus.successful) and settings.hyperparameters != "discrepancy"
-    if judged and fit.reduced_chi2 > 1.0 and fit.advice():
-        warnings.warn(fit.advice(), stacklevel=2)
-    return fit
 
 
 class _Reached(NamedTuple):
@@ -186,7 +201,9 @@ class _Run:
             self.solves += 1
             inner = self.iterations + int(state.descent_state.iterations)
             loss, left = float(state.f_info.as_min()), float(state.descent_state.change)
-            self.bar.show(f"step {self.solves}, misfit {loss:.5g}, {inner} inner iterations, {left:.2g} to go")
+            self.bar.show(
+                f"step {self.solves}, misfit {loss:.5g}, {inner} inner iterations, remaining change {left:.2g}"
+            )
             result = _status(state, gauss_newton.converged(state), settings.stall)
             if result != FitStatus.max_steps_reached:
                 break
