@@ -24,7 +24,7 @@ class Reading(NamedTuple):
         max_bytes: Largest array to load.
         extent: (Lx, Ly) of the map [mm], where known: it settles what text leaves open.
         spacing: (dx, dy) of the map [mm], where that is known instead.
-        notes: What was odd, for the user; filled by readers.
+        notes: Remarks for the user; filled by readers.
     """
 
     path: Path
@@ -38,10 +38,10 @@ class Entry(NamedTuple):
     """One array of a file.
 
     Attributes:
-        kind: "numbers", or what it is instead, in words.
+        kind: "numbers", or a description of other contents.
         shape: Its shape, as the writing program shows it.
         load: Read it.
-        fields: List what a struct holds; None for what is no struct.
+        fields: Lists the fields of a struct; None for other arrays.
         spacing: (dx, dy) between samples [mm], where the file states it.
     """
 
@@ -53,7 +53,7 @@ class Entry(NamedTuple):
 
 
 def other(kind: str, shape: tuple[int, ...] = (), fields: Callable[[], dict[str, Entry]] | None = None) -> Entry:
-    """List something that cannot be loaded as numbers; `kind` says what it is."""
+    """Make an entry that cannot be loaded as numbers; `kind` describes it."""
 
     def load() -> np.ndarray:
         raise MeasurementError(f"holds {kind}, no numbers.")
@@ -67,7 +67,7 @@ def damaged(cause: Exception) -> Entry:
 
 
 def kind_of(dtype: np.dtype) -> str:
-    """Say in words what an array of a type holds."""
+    """Describe the contents of an array of a type."""
     words = {"f": "numbers", "i": "numbers", "u": "numbers", "c": "complex numbers", "U": "text", "S": "text"}
     words |= {"b": "true/false values", "O": "a cell array or objects", "V": "a struct"}
     return words.get(dtype.kind, f"of type {dtype}")

@@ -1,6 +1,6 @@
 """Datasets of results to and from netCDF-4 files.
 
-Edge of the chain: what `to_xarray` labelled is stored with all its attributes, and comes back the same.
+Edge of the chain: a data set of `to_xarray` is stored with all its attributes, and read back unchanged.
 """
 
 import os

@@ -71,7 +71,7 @@ def _of_spectra(spectra: Spectra) -> dict[str, Any]:
 
 
 def own_volume(stored: Stored) -> OctVolume | None:
-    """Make a volume of what `write_hdf5` wrote; None of anything else."""
+    """Read a volume of `write_hdf5`; None for other files."""
     known = stored.attributes
     if _text(known.get("format")) != _VOLUME:
         return None
@@ -86,7 +86,7 @@ def own_volume(stored: Stored) -> OctVolume | None:
 
 
 def own_spectra(stored: Stored) -> Spectra | None:
-    """Make spectra of what `write_hdf5` wrote; None of anything else."""
+    """Read spectra of `write_hdf5`; None for other files."""
     known = stored.attributes
     if _text(known.get("format")) != _SPECTRA:
         return None

@@ -1,4 +1,4 @@
-"""OCT volumes in files that know nothing of OCT: raw numbers, .npy, HDF5, .mat and TIFF stacks.
+"""OCT volumes in general file formats: raw numbers, .npy, HDF5, .mat and TIFF stacks.
 
 The caller states what the file cannot: order of the axes, spacing, and what the numbers are. Arrays stay in the file
 where they lie there in one piece.
@@ -33,7 +33,7 @@ _COMPLEX = (np.dtype([("real", "<f4"), ("imag", "<f4")]), np.dtype([("real", "<f
 
 
 class Stored(NamedTuple):
-    """A 3-D array of a file, the fastest axis last, and what the file says of it."""
+    """A 3-D array of a file, the fastest axis last, with its attributes."""
 
     values: np.ndarray
     attributes: dict[str, Any]

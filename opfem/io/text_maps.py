@@ -129,7 +129,7 @@ def _without_index(table: Table) -> Table:
 
 
 def _triplets(table: Table, reading: Reading, names: list[str]) -> np.ndarray | None:
-    """Put x, y, z of points that fill a grid together to a map; None for what is no list of points."""
+    """Assemble x, y, z of points that fill a grid to a map; None for other tables."""
     if table.numbers.shape[1] != 3 or table.words or len(table.lines) < 4:
         return None
     x, y, z = table.numbers.T
@@ -166,7 +166,7 @@ def _positions(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _axes(table: Table, reading: Reading) -> tuple[Table, _Axis | None, _Axis | None] | None:
-    """Split coordinates of columns and rows off; None where the table holds thickness alone."""
+    """Separate coordinates of columns and rows; None where the table contains thickness only."""
     numbers = table.numbers
     if min(numbers.shape) < 2:
         return None

@@ -121,9 +121,9 @@ def write_pvd(datasets: Sequence[xr.Dataset], path: str | os.PathLike, times: Se
     The .pvd file comes last, so that it never lists a file that is not there.
 
     Args:
-        datasets: What `to_xarray` returned, for one state after the other.
+        datasets: Results of `to_xarray`, one per state.
         path: File to make or replace; must end in .pvd. The others are called `<stem>_000.vtu` and so on.
-        times: What ParaView shows as time, rising; None counts 0, 1, 2, …
+        times: Times for ParaView, rising; None: 0, 1, 2, …
 
     Raises:
         ValueError: For another suffix, no state, or times that do not rise or do not match.
@@ -165,7 +165,7 @@ def _hexahedra(points: Float[np.ndarray, "3 mz my mx"]) -> "pyvista.Unstructured
 def _point_arrays(
     dataset: xr.Dataset, displacement: Float[np.ndarray, "3 mz my mx"], body: str, faces: dict[str, bool]
 ) -> dict[str, np.ndarray]:
-    """Collect what is known at a body's nodes.
+    """Collect the nodal fields of a body.
 
     Args:
         dataset: Result of `to_xarray`.

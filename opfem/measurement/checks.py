@@ -1,7 +1,7 @@
 """Checks of the arguments of a `ThicknessMap`; each raises a `ValueError` that names the next step.
 
 Only concrete numbers can be checked: inside jit, grad and vmap the checks of values do nothing,
-those of shapes still hold. `piles` and `off_square` are for readers: what they find may be meant.
+those of shapes still apply. `piles` and `off_square` are for readers: their findings may be intended.
 """
 
 from typing import Any, NamedTuple
@@ -83,7 +83,7 @@ def doubtful_unit(thickness: np.ndarray) -> tuple[str, str, float] | None:
         thickness: Thickness that should be in mm, without masked pixels.
 
     Returns:
-        None when the range is plausible; else what the map spans, the guessed unit, and its size [mm].
+        None for a plausible range; else the range, the guessed unit, and its size [mm].
     """
     low, high = float(thickness.min()), float(thickness.max())
     if THINNEST <= high <= THICKEST:

@@ -44,7 +44,7 @@ class Program:
         self._compiled = None if plan.mode == "call" else self._compile(_padded(example, plan.points))
 
     def outcomes(self, columns: Columns) -> list[Outcome]:
-        """Compute the points of a batch; what raises becomes an outcome."""
+        """Compute the points of a batch; an exception becomes an outcome."""
         count = len(next(iter(columns.values())))
         if self._compiled is None:
             points = [{name: column[i].item() for name, column in columns.items()} for i in range(count)]
@@ -128,9 +128,9 @@ class Batch:
 
     Args:
         size: Points that one call of the compiled program computes; None: 1, or 32 with "vmap".
-        mode: "map", "vmap", "call" (for what jit cannot trace, such as `fit_traction`) or "auto": "map" on a CPU, where
-            lanes that wait for the slowest cost as much as those that work, "vmap" on an accelerator, "call" where
-            tracing fails.
+        mode: "map", "vmap", "call" (for functions that jit cannot trace, such as `fit_traction`) or "auto": "map" on a
+            CPU, where lanes that wait for the slowest cost as much as those that work, "vmap" on an accelerator, "call"
+            where tracing fails.
         threads: Batches computed side by side; None: one for each core on a CPU, else one.
 
     Raises:

@@ -41,7 +41,7 @@ def hash_of(what: str, part: Any) -> str:
     """Hash a function, an array, or anything made of those.
 
     Args:
-        what: What it is called in a message.
+        what: Its name in a message.
         part: Functions count by their code and by everything that they capture: closures, defaults and the globals
             that they name; functions of libraries by their name.
 
@@ -49,7 +49,7 @@ def hash_of(what: str, part: Any) -> str:
         SHA-256 in hexadecimal, the same in every process.
 
     Raises:
-        ValueError: If it holds something whose content is unknown, such as an open file or a random generator.
+        ValueError: If it contains an object of unknown content, such as an open file or a random generator.
     """
     return _Hashes().of(what, part).hex()
 
@@ -114,7 +114,7 @@ class _Hashes:
 
     def _function(self, path: str, fn: types.FunctionType) -> Iterator[bytes]:
         home = sys.modules.get(fn.__globals__.get("__name__", "__main__"))
-        if home is not None and _is_library(home):  # its version says what its code and its globals are
+        if home is not None and _is_library(home):  # its version determines its code and its globals
             yield f"library {home.__name__}.{fn.__code__.co_qualname}".encode()
             if hasattr(fn, "__wrapped__"):
                 yield self.of(path, fn.__wrapped__)
@@ -162,7 +162,7 @@ def _digest(pieces: Iterable[bytes]) -> bytes:
 
 
 def _simple(part: Any) -> list[bytes] | None:
-    """Return the bytes of what has no parts, else None."""
+    """Return the bytes of an object without parts, else None."""
     if isinstance(part, jax.Array) and jnp.issubdtype(part.dtype, jax.dtypes.prng_key):
         part = jax.random.key_data(part)
     if isinstance(part, jax.Array | np.ndarray | np.generic):

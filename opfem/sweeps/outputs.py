@@ -26,7 +26,7 @@ ERROR, NONFINITE, SUCCESSFUL = "error", "nonfinite", "successful"
 GOOD = CONVERGED
 """Statuses of points that have a result."""
 _ENDS = {"solve": RESULTS, "fit": FitStatus}
-# Equinox offers no other way from a name to its item.
+# Equinox has no public mapping from names to items.
 _NAMES = {kind: enumeration._name_to_item for kind, enumeration in _ENDS.items()}
 _ELEMENTS = ("y_element", "x_element")
 FIELDS: dict[str, tuple[tuple[str, ...], str, str, Callable[[Any], Any]]] = {
@@ -88,11 +88,11 @@ class OutputError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Outputs:
-    """Turns what a function returns into named arrays. Works inside jit; labels do not depend on numbers.
+    """Converts the results of a function to named arrays. Works inside jit; labels do not depend on numbers.
 
     Args:
         name: Name of an output that has none.
-        keep: What to keep of a solution, or a function that reduces what was returned to a dict of arrays.
+        keep: Fields of a solution to store, or a function that reduces a result to a dict of arrays.
         units: Units of axes, and of outputs without a known unit.
         axes: Names of the axes.
     """
@@ -103,11 +103,11 @@ class Outputs:
     axes: tuple[str, ...]
 
     def arrays(self, returned: Any) -> tuple[dict[str, Array], dict[str, Label]]:
-        """Name the arrays in what a function returned, and label them.
+        """Name and label the arrays of a result.
 
         Raises:
             OutputError: If it contains anything but numbers, arrays, solutions and dicts of them, or `keep` names
-                what is not there.
+                an unknown field.
         """
         values, labels = {}, {}
         if callable(self.keep):

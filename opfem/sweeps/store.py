@@ -1,6 +1,6 @@
 """Folder of a resumable sweep: its inputs, and one complete file for every finished point.
 
-Files appear by renaming, whole or not at all, under names that say what they hold, so that any number of
+Files appear by renaming, whole or not at all, under names that identify their contents, so that any number of
 processes may work on one sweep.
 """
 
@@ -79,7 +79,7 @@ class Folder:
         plan: How the sweep was begun; None: it was not.
 
     Raises:
-        ValueError: If the folder holds another sweep, or something else.
+        ValueError: If the folder contains another sweep, or other files.
     """
 
     def __init__(self, path: Path, inputs: dict[str, str], keys: list[str]):
@@ -141,7 +141,7 @@ class Folder:
         self._finished.add(point)
 
     def read(self, point: int) -> Outcome:
-        """Read a finished point; zip files carry checksums, which catches what the disk has damaged."""
+        """Read a finished point; zip files carry checksums, which detect damage."""
         with self._path(point).open("rb") as file, np.load(file, allow_pickle=False) as stored:
             record = json.loads(str(stored["record"]))
             if record.pop("key") != self._keys[point]:

@@ -1,6 +1,6 @@
 """`sweep`: a function at many points, as one labelled table.
 
-Sees the whole chain; what is swept is any function of numbers, and a solve is one.
+It sees the whole chain and sweeps any function of numbers, such as a solve.
 """
 
 import dataclasses
@@ -47,13 +47,13 @@ def sweep(
     `wall_time` [s] of a point in a batch is its share of it. A `Solution` must come from `solve(..., throw=False)`.
 
     Args:
-        fn: Function of numbers, called with one argument for each axis; what is the same for all points it captures.
+        fn: Function of numbers, called with one argument for each axis; it captures constants.
             Returns a number, an array, a `Solution`, a `TractionFit`, or a dict of these.
         axes: Values of each argument: a grid of all combinations; or points from `zip_` or `sample`.
         keep: Fields of a solution to store: "max_pressure", "pressure", "traction", "slip", "contact_status",
             "displacement", "stress_zz", "thickness", of a fit also "pressure_std", "residual", "chi2",
             "effective_dof", and the names in `stats`; None: pressure and all of `stats`. Or a function that reduces
-            what `fn` returned to a dict of arrays.
+            the result of `fn` to a dict of arrays.
         units: Units of axes, and of outputs without a known unit.
         execution: `Batch`, `Devices` or `Cluster`.
         out: Folder that keeps every finished point: a sweep that was interrupted goes on where it was when it is
@@ -65,7 +65,7 @@ def sweep(
 
     Raises:
         ValueError: For an axis that is empty or no argument of `fn`, units that contradict an output's own, an
-            `out` with different inputs, or a function that captures what cannot be hashed.
+            `out` with different inputs, or a function that captures objects that cannot be hashed.
         RuntimeError: If the function raised at every point.
 
     Example:
@@ -153,7 +153,7 @@ def _run(
     store: Memory | Folder,
     shown: Progress,
 ) -> dict[int, Outcome]:
-    """Compute what is missing; return the points where the function raised, which are not kept."""
+    """Compute missing points; return those where the function raised, which are not stored."""
     batches = [range(i, min(i + plan.points, len(points))) for i in range(0, len(points), plan.points)]
     missing = [i for i in range(len(points)) if not store.has(i)]
     errors: dict[int, Outcome] = {}
