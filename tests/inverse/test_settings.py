@@ -15,7 +15,7 @@ def test_settings_are_changed_by_name():
 
 def test_unknown_setting_is_refused_with_those_there_are():
     with pytest.raises(TypeError, match=r"unknown argument 'max_step'.*max_steps"):
-        op.fit_traction(None, None, None, max_step=3)
+        op.FitSettings().changed(max_step=3)
 
 
 def test_every_setting_is_documented():
