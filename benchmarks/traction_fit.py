@@ -32,8 +32,8 @@ from jax import monitoring
 from scipy.interpolate import RectBivariateSpline
 
 import opfem as op
-from opfem.inverse.conjugate_gradients import least_squares, plus
-from opfem.inverse.observation import interface_heights
+from opfem.inverse.measured_surface import interface_heights
+from opfem.optimise.conjugate_gradients import least_squares, plus
 
 C10, C01, BULK = 2.23e-3, 7.03e-4, 0.11732  # MPa
 NOISE = 2e-3  # mm
@@ -235,7 +235,7 @@ def coin_case(path: Path, n: int, model_std: float, out: Path | None) -> None:
     if bool(fit.result != op.FitStatus.successful):
         return
     white = plus(fit.posterior.white, fit.posterior.draw(jax.random.key(6))[0])
-    load = jax.tree.map(lambda v: v[0], fit.misfit.tractions(white))
+    load = jax.tree.map(lambda v: v[0], fit.objective.tractions(white))
     truth = op.solve(palpation, load, op.Newton(increments=2))
     # White noise of as much power as one error per element.
     missed = model_std * 160 / n * np.random.default_rng(5).standard_normal((161, 161))

@@ -1,6 +1,7 @@
 """The public names and the modules that hold them; read by `__init__.py`, type checkers and editors."""
 
 from . import datasets as datasets
+from .calibration import Calibration as Calibration, calibrate as calibrate
 from .compilation import cache_compilation as cache_compilation
 from .decks import (
     Deck as Deck,
@@ -10,23 +11,21 @@ from .decks import (
     read_inp as read_inp,
     write_inp as write_inp,
 )
+from .identification import ParameterFit as ParameterFit, fit_parameters as fit_parameters
 from .inverse import (
     AxialDisplacement as AxialDisplacement,
-    Calibration as Calibration,
     FitError as FitError,
+    FitSettings as FitSettings,
     FitStatus as FitStatus,
     ForceReading as ForceReading,
     LinearEstimate as LinearEstimate,
     LogNormal as LogNormal,
     Matern as Matern,
     Normal as Normal,
-    ParameterFit as ParameterFit,
     SideBulge as SideBulge,
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
     TractionFit as TractionFit,
-    calibrate as calibrate,
-    fit_parameters as fit_parameters,
     fit_traction as fit_traction,
     linear_estimate as linear_estimate,
     mesh_error as mesh_error,

@@ -10,7 +10,7 @@ class Choices(NamedTuple):
     """How programs are built for a kind of device.
 
     Attributes:
-        bordered: Keep what XLA would fuse, and so compute many times over, apart (`mechanics.staging.apart`).
+        bordered: Fusion barriers (`mechanics.unfused.unfused`).
         one_by_one: Go through layers or rows of elements, and blocks of their matrices, one after the other, so that
             intermediates stay in the cache; else all at once, as many threads want.
         threads: Compute batches of a sweep in threads, a point at a time; else in one, by `jax.vmap`.

@@ -12,7 +12,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "opfem"
-CHAIN = ("measurement", "model", "mechanics", "solvers", "inverse", "results")
+CHAIN = (
+    "measurement",
+    "model",
+    "calibration",
+    "mechanics",
+    "solvers",
+    "optimise",
+    "inverse",
+    "identification",
+    "results",
+)
 EVERYONE = {"_types", "_checks", "_repr", "_device"}
 
 MAY_IMPORT = {stage: set(CHAIN[: place + 1]) for place, stage in enumerate(CHAIN)}

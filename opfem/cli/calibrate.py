@@ -9,7 +9,7 @@ import xarray as xr
 from rich.console import Console
 from rich.table import Table
 
-from ..inverse import Calibration, calibrate
+from ..calibration import Calibration, calibrate
 from ..io import netcdf_bytes, read_stress_strain, write_together
 from ..solvers.progress import Progress
 from .curve_options import CurveOptions, LawOptions

@@ -1,4 +1,4 @@
-"""From a traction to the displacement: on the host with a cheap Jacobian, or traced with exact derivatives."""
+"""Forward solve of a fit: on the host with its first-order derivative, or traced with derivatives of any order."""
 
 from typing import NamedTuple
 
@@ -19,27 +19,27 @@ from ..solvers.stepping import Stepping, attempt, begin, unfinished
 Field = Float[Array, "3 mz my mx"]
 
 
-class Pressed(NamedTuple):
-    """The layer under a traction.
+class TracedState(NamedTuple):
+    """State of the layer at the end of a traced solve.
 
     Attributes:
         u: Displacement of its nodes [mm].
-        reached: Load fraction that the solve reached [-].
+        fraction: Load fraction reached [-].
     """
 
     u: Field
-    reached: Array
+    fraction: Array
 
 
-class Way(NamedTuple):
-    """How the layer went under a traction.
+class ForwardSolve(NamedTuple):
+    """Forward solve of the layer under a traction.
 
     Attributes:
         palpation: The experiment.
         load: The traction.
-        problem: Both, discretised.
-        end: Where the solve ended.
-        solves: Those that led there.
+        problem: The discretised problem.
+        end: State of the load stepping at its end.
+        solves: Equilibrium solves of the accepted increments.
     """
 
     palpation: Palpation
@@ -49,14 +49,14 @@ class Way(NamedTuple):
     solves: list[Solve]
 
     def solution(self, solver: Newton) -> Solution:
-        """Return the solution, first finding it where the solve was given up because of its length."""
-        return judged(finish(self.problem, to_the_end(self.problem, self.end, solver), self.palpation, self.load))
+        """Return the solution; a solve that stopped at `max_path` is resumed first."""
+        return judged(finish(self.problem, resume(self.problem, self.end, solver), self.palpation, self.load))
 
 
-def press(palpation: Palpation, load: Traction, solver: Newton) -> Way:
-    """Solve under a traction, one increment after the other, by the program that every solve of this mesh shares.
+def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> ForwardSolve:
+    """Solve under a traction, increment by increment, by the program that all solves of this mesh share.
 
-    It ends where the solves are more than `Newton.max_path`, those on the way through a snap included.
+    It stops where the path is longer than `Newton.max_path`, solves of a snap-through included.
 
     Args:
         palpation: The experiment.
@@ -65,28 +65,28 @@ def press(palpation: Palpation, load: Traction, solver: Newton) -> Way:
     """
     problem, s = prepare(palpation, load, None, solver, None, False)
     solves: list[Solve] = []
-    while bool(unfinished(s)) and int(s.length) <= solver.max_path:
+    while bool(unfinished(s)) and int(s.path.length) <= solver.max_path:
         before, s = s, compiled_attempt(problem, s, solver)
-        if int(s.length) > int(before.length):
-            solves.append(Solve(before.origin, s.origin, before.viscosity))
+        if int(s.path.length) > int(before.path.length):
+            solves.append(Solve(before.origin, s.origin, before.snap.viscosity))
         else:
-            del solves[int(s.length) :]
-    return Way(palpation, load, problem, s, solves[: int(s.kept)])
+            del solves[int(s.path.length) :]
+    return ForwardSolve(palpation, load, problem, s, solves[: int(s.path.kept)])
 
 
-def to_the_end(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
-    """Go on with a solve until it ends."""
+def resume(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
+    """Continue the load stepping to its end."""
     while bool(unfinished(s)):
         s = compiled_attempt(problem, s, solver)
     return s
 
 
 class Linearised(eqx.Module):
-    """The derivative of the displacement by the problem, first order and to 1e-4.
+    """First-order derivative of the displacement by the problem, to 1e-4.
 
     Attributes:
         problem: The problem.
-        slots: The solves that led to the displacement, linearised.
+        slots: Linearised equilibrium solves of the path.
         solver: Settings of the solve.
     """
 
@@ -95,35 +95,35 @@ class Linearised(eqx.Module):
     solver: Newton
 
     @classmethod
-    def along(cls, way: Way, solver: Newton) -> "Linearised":
-        """Linearise a way, one solve after the other."""
-        return cls(way.problem, [Slot(solve, linearise(way.problem, solve)) for solve in way.solves], solver)
+    def along(cls, path: ForwardSolve, solver: Newton) -> "Linearised":
+        """Linearise the solves of a load path."""
+        return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in path.solves], solver)
 
     def push(self, moved: Problem, first: Handed) -> Field:
-        """Multiply a change of the problem, and of what the first solve starts from, with it."""
+        """Compute the change of the displacement with changes of the problem and of the initial state."""
         return push(self.problem, self.slots, moved, first, self.solver).unknowns.u
 
     def pull(self, weights: Field) -> Problem:
-        """Multiply weights of the displacement with its transpose by the load."""
-        return pull(self.problem, self.slots, of_load(self.problem), weights, self.solver)
+        """Compute the transposed product: from weights of the displacement to weights of the load."""
+        return pull(self.problem, self.slots, load_mask(self.problem), weights, self.solver)
 
 
-def of_load(problem: Problem) -> Problem:
-    """Tell which numbers of a problem depend on the traction."""
+def load_mask(problem: Problem) -> Problem:
+    """Mark the numbers of a problem that depend on the traction."""
     none = jax.tree.map(lambda _: False, problem)
     return eqx.tree_at(lambda p: (p.dead[1], p.contacts.sample.imposed.end), none, (True, True))
 
 
-def press_exactly(palpation: Palpation, load: Traction, solver: Newton) -> Pressed:
-    """Solve under a traction inside a trace; derivatives of any order, to 1e-10."""
+def traced_solve(palpation: Palpation, load: Traction, solver: Newton) -> TracedState:
+    """Solve under a traction inside a trace, with derivatives of any order to 1e-10."""
     problem = discretise(palpation, load, None, solver.face_rule)
     start = begin(problem.initial_state(), solver, True)
     frozen, settings = jax.lax.stop_gradient((problem, solver))
 
     def goes_on(s):
-        return unfinished(s) & (s.length <= settings.max_path)
+        return unfinished(s) & (s.path.length <= settings.max_path)
 
     end = jax.lax.while_loop(goes_on, lambda s: attempt(frozen, s, settings), jax.lax.stop_gradient(start))
-    assert end.path is not None
-    _, state = follow_path(problem, start.state, end.path, end.kept, settings)
-    return Pressed(state.u, end.state.fraction)
+    assert end.path.solves is not None
+    _, state = follow_path(problem, start.state, end.path.solves, end.path.kept, settings)
+    return TracedState(state.u, end.state.fraction)

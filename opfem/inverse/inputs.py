@@ -1,4 +1,4 @@
-"""What a fit is given: checked, and stacked over maps."""
+"""Checks of the arguments of a fit, and their stacking over maps."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,26 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._checks import concrete
 from ..measurement import ThicknessMap
 from ..model import Contact, Palpation
 from ..model.plausible import check_against_layer
-from .data import AxialDisplacement
-from .noise import noise_std
-from .observation import Observation
+from .measured_surface import MeasuredSurface, noise_std
+from .observations import AxialDisplacement
 from .parameters import check_parameters
-from .prior import AbstractPrior, Matern
+from .prior import AbstractPrior
 
 
 def as_tuple(value: Any) -> tuple:
-    """Make one thing a sequence of one; of nothing, an empty one."""
+    """Return a tuple of the values: one value becomes a tuple of one, None an empty one."""
     if value is None:
         return ()
     return tuple(value) if isinstance(value, Sequence) else (value,)
 
 
 def stacked(name: str, value: Any, maps: int) -> Any:
-    """Stack what is given for each map."""
+    """Stack the values of each map."""
     if value is None:
         return None
     each = as_tuple(value)
@@ -37,7 +35,7 @@ def stacked(name: str, value: Any, maps: int) -> Any:
 
 
 def stacked_maps(maps: tuple[ThicknessMap, ...]) -> tuple[ThicknessMap, Array]:
-    """Stack maps, and their noise."""
+    """Stack maps, and the standard deviations of their noise."""
     plain = [ThicknessMap(m.values, m.extent, None, m.origin, None, m.mask, noise_length=m.noise_length) for m in maps]
     std = [jnp.broadcast_to(noise_std("fit_traction", m), m.shape) for m in maps]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *plain), jnp.stack(std)
@@ -51,7 +49,7 @@ def check_inputs(
     parameters: Mapping[str, Any],
     inside: tuple[AxialDisplacement, ...],
 ) -> None:
-    """Refuse what a fit cannot work with."""
+    """Raise ValueError for arguments that a fit cannot use."""
     if not isinstance(palpation.sample, Contact):
         raise ValueError(
             f"fit_traction needs sample=Contact(law, friction), got sample={type(palpation.sample).__name__}()."
@@ -93,18 +91,12 @@ def check_inputs(
                 f"fit_traction.{name} must be Matern(...), Tikhonov(...) or TotalVariation(...), got "
                 f"{type(one).__name__}."
             )
-        length = concrete(one.length) if isinstance(one, Matern) else None
-        size = concrete(jnp.stack(palpation.mesh().spacing).max())
-        if length is not None and size is not None and np.any(length < size):
-            raise ValueError(
-                f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh "
-                "cannot follow it. Pass a longer length, or Palpation(elements=...) with more."
-            )
+        one.check_resolved(palpation.mesh().spacing)
 
 
-def check_covered(maps: tuple[ThicknessMap, ...], observations: Observation) -> None:
-    """Refuse a map that says nothing of the layer."""
-    for number, (m, informed) in enumerate(zip(maps, np.asarray(observations.informed), strict=True)):
+def check_covered(maps: tuple[ThicknessMap, ...], surfaces: MeasuredSurface) -> None:
+    """Raise ValueError for a map without data on the layer."""
+    for number, (m, informed) in enumerate(zip(maps, np.asarray(surfaces.informed), strict=True)):
         if informed == 0:
             raise ValueError(
                 f"fit_traction: map {number} has no pixel with data on the layer, which covers 0 to its extent [mm]; "

@@ -1,7 +1,7 @@
-"""The residuals of a fit and their Jacobian, by few compiled programs driven from the host.
+"""Matrix-free Jacobian of a fit's residuals, by few compiled programs driven from the host.
 
-A solve under a traction, the tangent of an increment, and the products of an increment with a change and with weights
-are one program each: steps of the fit, inner iterations, draws and all else that is asked of the Jacobian share them.
+Load stepping, tangent, forward product and transposed product of an increment are one program each. Gauss–Newton steps,
+CG iterations and posterior draws share them.
 """
 
 import dataclasses
@@ -14,87 +14,87 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
+from ..optimise.conjugate_gradients import dot, plus
 from ..solvers import derivative
 from ..solvers.compiling import QuickJit
 from ..solvers.derivative import Handed, Solve
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
 from ..solvers.solve import compiled_attempt, finish, prepare
-from .conjugate_gradients import dot, plus
-from .forward import Linearised, of_load, press
-from .misfit import Misfit
+from .forward import Linearised, forward_solve, load_mask
+from .objective import Objective
 from .preconditioner import Unknowns
 
 
 class Point:
-    """The residuals at one point.
+    """Residuals at one point.
 
     Attributes:
-        ways: How the layer went under the load of each map.
+        paths: Load path under the load of each map.
         residuals: Standardised residuals by source.
-        heights: Of the interface under each load [mm].
-        carried: Whether the layer carries every load.
-        followed: Whether derivatives follow all increments.
+        heights: Height of the interface under each load [mm].
+        in_equilibrium: Whether an equilibrium exists under every load.
+        within_max_path: Whether all load paths are within `Newton.max_path`, the limit of the derivative.
     """
 
-    def __init__(self, misfit: Misfit, white: Unknowns):
-        """Solve under the loads that unknowns stand for."""
-        solver, maps = misfit.solver, jnp.arange(white.normal.shape[0])
-        self.ways = [press(*_experiment(misfit, white, i), solver=solver) for i in maps]
-        self._at = _At(
-            misfit,
+    def __init__(self, objective: Objective, white: Unknowns):
+        """Solve under the loads of the unknowns."""
+        solver, maps = objective.solver, jnp.arange(white.normal.shape[0])
+        self.paths = [forward_solve(*_experiment(objective, white, i), solver=solver) for i in maps]
+        self._at = _Evaluated(
+            objective,
             white,
-            jnp.stack([way.end.state.u for way in self.ways]),
-            jnp.stack([way.end.state.fraction for way in self.ways]),
+            jnp.stack([path.end.state.u for path in self.paths]),
+            jnp.stack([path.end.state.fraction for path in self.paths]),
         )
         self.residuals, self.heights = _residuals(self._at)
-        self.carried = bool(jnp.all(self._at.reached >= 1.0))
-        self.followed = all(int(way.end.kept) <= solver.max_path for way in self.ways)
+        self.in_equilibrium = bool(jnp.all(self._at.fraction >= 1.0))
+        self.within_max_path = all(int(path.end.path.kept) <= solver.max_path for path in self.paths)
 
     def jacobian(self) -> "Jacobian":
-        """Linearise here."""
-        lines = [Linearised.along(way, self._at.misfit.solver) for way in self.ways]
+        """Linearise the residuals."""
+        lines = [Linearised.along(path, self._at.objective.solver) for path in self.paths]
         J = Jacobian(self._at, lines, self.residuals, [])
         nothing = jax.tree.map(jnp.zeros_like, self._at.white)
         ones = [{**nothing.numbers, name: jnp.ones(())} for name in nothing.numbers]
         return dataclasses.replace(J, of_numbers=[J.mv(nothing._replace(numbers=one)) for one in ones])
 
 
-class _At(NamedTuple):
-    misfit: Misfit
+class _Evaluated(NamedTuple):
+    objective: Objective
     white: Unknowns
     u: Float[Array, "maps 3 mz my mx"]
-    reached: Float[Array, " maps"]
+    fraction: Float[Array, " maps"]
 
 
 class Jacobian(eqx.Module):
-    """The derivative of the residuals by white unknowns, known by its products.
+    """Derivative of the residuals by white unknowns, as products.
 
     Attributes:
-        at: The point.
+        at: The point and its solved states.
         maps: Derivative of the displacement under each load.
         residuals: Residuals at the point.
-        of_numbers: Derivative by each fitted number: with it, transposed products go without transposed derivatives by
-            geometry and material.
+        of_numbers: Columns of fitted numbers: transposed products then need no transposed derivative by geometry and
+            material.
     """
 
-    at: _At
+    at: _Evaluated
     maps: list[Linearised]
     residuals: dict[str, Any]
     of_numbers: list[dict[str, Any]]
 
     def mv(self, change: Unknowns) -> dict[str, Any]:
-        """Multiply with a change of the unknowns."""
+        """Compute the change of the residuals with a change of the unknowns."""
         moved = [
             line.push(*_of_problem(self.at, change, i)) for i, line in zip(self._numbered(), self.maps, strict=True)
         ]
         return _of_residuals(self.at, change, jnp.stack(moved))
 
     def transposed_mv(self, weights: dict[str, Any]) -> Unknowns:
-        """Multiply weights of the residuals with the transpose."""
-        weighted, of_u = _pulled_to_u(self.at, weights)
+        """Compute the transposed product with weights of the residuals."""
+        weighted, of_u = _transposed_to_u(self.at, weights)
         for i, line in zip(self._numbered(), self.maps, strict=True):
-            weighted = _pulled_to_white(self.at, line.pull(of_u[i]), i, weighted)
+            weighted = _transposed_to_white(self.at, line.pull(of_u[i]), i, weighted)
         numbers = {
             name: dot(column, weights) for name, column in zip(self.at.white.numbers, self.of_numbers, strict=True)
         }
@@ -123,29 +123,29 @@ class Transposed(eqx.Module):
     jacobian: Jacobian
 
     def mv(self, weights: dict[str, Any]) -> Unknowns:
-        """Multiply with it."""
+        """Compute the product."""
         return self.jacobian.transposed_mv(weights)
 
 
-def programs(misfit: Misfit, white: Unknowns) -> list[tuple[QuickJit, tuple]]:
-    """List what a fit compiles, the longest first, with arguments of the right shapes, to compile it early."""
+def programs(objective: Objective, white: Unknowns) -> list[tuple[QuickJit, tuple]]:
+    """List the programs of a fit, the longest compilation first, with arguments of their shapes."""
     i, maps = jnp.arange(1)[0], white.normal.shape[0]
-    palpation, load = _experiment(misfit, white, i)
-    problem, start = prepare(palpation, load, None, misfit.solver, None, False)
+    palpation, load = _experiment(objective, white, i)
+    problem, start = prepare(palpation, load, None, objective.solver, None, False)
     u, reached = jnp.stack([start.state.u] * maps), jnp.stack([start.state.fraction] * maps)
-    at = _At(misfit, white, u, reached)
+    at = _Evaluated(objective, white, u, reached)
     (residuals, _), (moved, first) = _zeros(_residuals, at), _zeros(_of_problem, at, white, i)
-    solve = Solve(start.origin, start.origin, start.viscosity)
-    varies = of_load(problem)
+    solve = Solve(start.origin, start.origin, start.snap.viscosity)
+    varies = load_mask(problem)
     return [
-        (compiled_attempt, (problem, start, misfit.solver)),
-        *derivative.programs(problem, solve, moved, first, varies, misfit.solver),
+        (compiled_attempt, (problem, start, objective.solver)),
+        *derivative.programs(problem, solve, moved, first, varies, objective.solver),
         (finish, (problem, start, palpation, load)),
-        (_pulled_to_u, (at, residuals)),
+        (_transposed_to_u, (at, residuals)),
         (_of_residuals, (at, white, u)),
         (_residuals, (at,)),
         (_of_problem, (at, white, i)),
-        (_pulled_to_white, (at, eqx.filter(problem, varies), i, white._replace(numbers={}))),
+        (_transposed_to_white, (at, eqx.filter(problem, varies), i, white._replace(numbers={}))),
     ]
 
 
@@ -154,54 +154,54 @@ def _zeros(function: Callable, *arguments: Any) -> Any:
 
 
 @QuickJit
-def _experiment(misfit: Misfit, white: Unknowns, i: Array) -> tuple[Palpation, Traction]:
-    return misfit.experiment(white), misfit.load(white, i)
+def _experiment(objective: Objective, white: Unknowns, i: Array) -> tuple[Palpation, Traction]:
+    return objective.experiment(white), objective.load(white, i)
 
 
 @QuickJit
-def _residuals(at: _At) -> tuple[dict[str, Any], Array]:
-    return at.misfit.residuals(at.white, at.u, at.reached)
+def _residuals(at: _Evaluated) -> tuple[dict[str, Any], Array]:
+    return at.objective.residuals(at.white, at.u, at.fraction)
 
 
 @QuickJit
-def _of_problem(at: _At, change: Unknowns, i: Array) -> tuple[Problem, Handed]:
-    """Compute the change of a map's problem, and of what its first solve starts from."""
+def _of_problem(at: _Evaluated, change: Unknowns, i: Array) -> tuple[Problem, Handed]:
+    """Compute the change of a map's discretised problem and initial state with the unknowns."""
 
     def problem(white):
-        laid = _laid(at.misfit, white, i)
+        laid = _discretised(at.objective, white, i)
         start = laid.initial_state()
-        varies = of_load(laid) if not white.numbers else jax.tree.map(eqx.is_inexact_array, laid)
+        varies = load_mask(laid) if not white.numbers else jax.tree.map(eqx.is_inexact_array, laid)
         return eqx.filter(laid, varies), Handed(start.unknowns, start.histories)
 
     return jax.jvp(problem, (at.white,), (change,))[1]
 
 
 @QuickJit
-def _of_residuals(at: _At, change: Unknowns, moved: Array) -> dict[str, Any]:
-    """Compute the change of the residuals with the unknowns and with the displacement."""
-    return jax.jvp(lambda w, u: at.misfit.residuals(w, u, at.reached)[0], (at.white, at.u), (change, moved))[1]
+def _of_residuals(at: _Evaluated, change: Unknowns, moved: Array) -> dict[str, Any]:
+    """Compute the change of the residuals with unknowns and displacement."""
+    return jax.jvp(lambda w, u: at.objective.residuals(w, u, at.fraction)[0], (at.white, at.u), (change, moved))[1]
 
 
 @QuickJit
-def _pulled_to_u(at: _At, weights: dict[str, Any]) -> tuple[Unknowns, Array]:
-    """Multiply with the transpose of `_of_residuals`, but for fitted numbers."""
+def _transposed_to_u(at: _Evaluated, weights: dict[str, Any]) -> tuple[Unknowns, Array]:
+    """Compute the transposed product of `_of_residuals`, fitted numbers excepted."""
 
     def residuals(white, u):
-        return at.misfit.residuals(white._replace(numbers=at.white.numbers), u, at.reached)[0]
+        return at.objective.residuals(white._replace(numbers=at.white.numbers), u, at.fraction)[0]
 
     return jax.vjp(residuals, at.white._replace(numbers={}), at.u)[1](weights)
 
 
 @QuickJit
-def _pulled_to_white(at: _At, weights: Problem, i: Array, so_far: Unknowns) -> Unknowns:
-    """Multiply with the transpose of `_of_problem`, but for fitted numbers."""
+def _transposed_to_white(at: _Evaluated, weights: Problem, i: Array, so_far: Unknowns) -> Unknowns:
+    """Compute the transposed product of `_of_problem`, fitted numbers excepted."""
 
     def problem(white):
-        laid = _laid(at.misfit, white._replace(numbers=at.white.numbers), i)
-        return eqx.filter(laid, of_load(laid))
+        laid = _discretised(at.objective, white._replace(numbers=at.white.numbers), i)
+        return eqx.filter(laid, load_mask(laid))
 
     return plus(so_far, jax.vjp(problem, at.white._replace(numbers={}))[1](weights)[0])
 
 
-def _laid(misfit: Misfit, white: Unknowns, i: Array) -> Problem:
-    return discretise(misfit.experiment(white), misfit.load(white, i), None, misfit.solver.face_rule)
+def _discretised(objective: Objective, white: Unknowns, i: Array) -> Problem:
+    return discretise(objective.experiment(white), objective.load(white, i), None, objective.solver.face_rule)

@@ -1,4 +1,4 @@
-"""How far the mesh is from the layer that it stands for: what a fit should allow for."""
+"""Discretisation error of the interface height, by Richardson extrapolation."""
 
 import dataclasses
 
@@ -8,18 +8,18 @@ from jaxtyping import Array, Float
 
 from ..model import Traction
 from ..solvers import Newton, Solution, solve
-from .observation import interface_heights
+from .measured_surface import interface_heights
 
-# Elements converge at second order: half as many along each axis are four times as far off.
+# Second-order convergence: on half as many elements along each axis the error is four times as large.
 _SECOND_ORDER = 3.0
 
 
 def mesh_error(solution: Solution, solver: Newton = Newton()) -> Float[Array, "half_my half_mx"]:
-    """Estimate what a mesh misses of the interface's height, by a solve on half as many elements along each axis.
+    """Estimate the discretisation error of the interface height by a solve on half as many elements along each axis.
 
-    A third of the difference, as for any second-order method (Richardson): its size, and roughly its pattern, where
-    half of the mesh still follows the load; too large where it does not. Its root mean square is a good
-    `fit_traction(model_std=)`; where it is well above the map's noise over an element, a finer mesh tells more.
+    The error is a third of the difference (Richardson extrapolation of a second-order method). It is overestimated
+    where half of the mesh does not resolve the load. Its root mean square is the default of `fit_traction(model_std=)`.
+    Refine the mesh where it is well above the map's noise per element.
 
     Args:
         solution: A solve under a traction, such as `TractionFit.solution`.
@@ -49,7 +49,7 @@ def mesh_error(solution: Solution, solver: Newton = Newton()) -> Float[Array, "h
 
 
 def can_halve(elements: tuple[int, int, int]) -> bool:
-    """Tell whether half as many elements make a mesh on which a surface can be looked at."""
+    """Return whether half as many elements are a mesh, of at least four along x and y."""
     return not any(n % 2 for n in elements) and min(elements[:2]) >= 8
 
 

@@ -1,4 +1,4 @@
-"""Numbers of the experiment that are fitted with the traction, or only allowed for in its uncertainty."""
+"""Fitted numbers of the experiment: their priors, and their places in it."""
 
 from collections.abc import Mapping
 from functools import reduce
@@ -14,15 +14,15 @@ from ..measurement import ThicknessMap
 from ..model import Palpation
 
 INDEX, OFFSET = "refractive_index", "l0_offset"
-"""Names that are no field of `Palpation`: the refractive index of the layer over the one that both maps were scaled
-with [-], and what is to be added to its unloaded thickness [mm]."""
+"""Names that are no field of `Palpation`: refractive index of the layer over the one that both maps were scaled with
+[-]; increment of its unloaded thickness [mm]."""
 
 
 class AbstractNumberPrior(eqx.Module):
-    """What is known of one number before the fit, as a function of a standard normal one."""
+    """Prior of one number, as a function of a standard normal number."""
 
     def number(self, white: Array) -> Array:
-        """Turn a standard normal number into one of this distribution."""
+        """Map a standard normal number to one of this distribution."""
         raise NotImplementedError
 
 
@@ -45,7 +45,7 @@ class Normal(AbstractNumberPrior):
         check_positive("Normal.std", "the number's unit", self.std)
 
     def number(self, white: Array) -> Array:
-        """Turn a standard normal number into one of this distribution."""
+        """Map a standard normal number to one of this distribution."""
         return self.mean + self.std * white
 
 
@@ -68,12 +68,12 @@ class LogNormal(AbstractNumberPrior):
         check_positive("LogNormal.spread", "-", self.spread)
 
     def number(self, white: Array) -> Array:
-        """Turn a standard normal number into one of this distribution."""
+        """Map a standard normal number to one of this distribution."""
         return self.median * jnp.exp(self.spread * white)
 
 
 def with_numbers(palpation: Palpation, numbers: Mapping[str, ScalarLike]) -> Palpation:
-    """Put numbers into an experiment.
+    """Return an experiment with other numbers.
 
     Args:
         palpation: The experiment.

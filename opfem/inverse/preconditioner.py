@@ -1,10 +1,8 @@
-"""The fit's preconditioner: the layer as its transfer function, as thick as it was measured.
+"""Preconditioner of a fit: the normal matrix of the linear layer, of the measured local thickness.
 
-Indentation grows about with the cube of the local thickness where the layer is thin against the waves of the
-pressure; nodes on edges press with half of an element, at corners with a quarter; and a layer under load is stiffer
-for long waves, friction or not. With that, and with what is masked, the normal matrix is no longer diagonal in
-cosines, but its products cost four transforms: its systems are solved by conjugate gradients of their own. Fitted
-numbers, coupled to everything but few, are added as a coarse space of exact products with the Jacobian.
+Local thickness, masks and the smaller tributary areas of edges make this matrix dense in cosine modes. Its products
+cost four cosine transforms, and inner conjugate gradients invert it. Fitted numbers, few but coupled to all modes, are
+deflated by a coarse space of exact Jacobian products.
 """
 
 from typing import Any, NamedTuple
@@ -16,28 +14,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..model import Bonded, Palpation
+from ..optimise.conjugate_gradients import dot, plus
 from ..solvers.compiling import QuickJit
-from .conjugate_gradients import dot, plus
-from .estimates import response
-from .observation import Nodes, Observation
-from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines
-from .transfer import wave_numbers
+from .linear_layer import response
+from .measured_surface import MeasuredSurface, Nodes
+from .prior import AbstractPrior, Spacing, cosine_transform, from_cosines, wave_numbers
 
+# Tolerance of the inner conjugate gradients: nearly linear, as flexible CG requires; and their limit of iterations.
 _RTOL = 1e-3
 _STEPS = 200
-# How a layer that slips on its window indents at finite strain: this part as at small strain, the rest as a bonded one.
-# The tangent of 40×40×4 elements at 12 % of strain has 0.46 for the mean and 0.40 for waves as long as 2π thicknesses,
-# but the first direction to 3e-2 takes fewer iterations where it is taken for stiffer: 5 at 0.2, 8 at 0.4, 14 at 1.
+# Finite-strain compliance of a layer that slips on its window: this share of the slipping one, the rest bonded. The
+# tangent of 40×40×4 elements at 12 % strain has 0.46 for the mean and 0.40 for waves of 2π thicknesses. CG iterations
+# of the first direction to 3e-2 are fewer with a stiffer layer: 5 at 0.2, 8 at 0.4, 14 at 1.
 _SLIPPING = 0.2
+# Bounds of the local over the mean thickness: splines oscillate where pixels are masked.
+_THINNEST, _THICKEST = 0.1, 10.0
 
 
 class Unknowns(NamedTuple):
-    """White unknowns of a fit: every number standard normal under the prior.
+    """White unknowns of a fit: each is standard normal under its prior.
 
     Attributes:
-        normal: Of the normal traction of every map `(maps, ny+1, nx+1)`.
-        lateral: Of the lateral traction `(maps, 2, ny+1, nx+1)`; None where it follows friction.
-        numbers: Of the experiment's fitted numbers, by name.
+        normal: Unknowns of the normal traction of every map `(maps, ny+1, nx+1)`.
+        lateral: Unknowns of the lateral traction `(maps, 2, ny+1, nx+1)`; None where it follows friction.
+        numbers: Unknowns of fitted numbers, by name.
     """
 
     normal: Float[Array, "maps my mx"]
@@ -46,20 +46,20 @@ class Unknowns(NamedTuple):
 
 
 def indentation(gain: Nodes, softness: Nodes, normal: Nodes) -> Nodes:
-    """Compute the small-strain indentation [mm] under a normal traction [MPa], of a layer as thick as it is locally."""
+    """Compute the small-strain indentation [mm] of the layer, of its local thickness, under a normal traction [MPa]."""
     parts = [np.r_[0.5, np.ones(n - 2), 0.5] for n in normal.shape]
     return softness * from_cosines(gain * cosine_transform(normal * np.outer(*parts)))
 
 
 class LayerNormal(eqx.Module):
-    """Approximate normal matrix of misfit and prior for each map; calling that of one multiplies with its inverse.
+    """Approximate normal matrix of misfit and prior of each map; a call computes the product with its inverse.
 
     Attributes:
         prior: The prior.
         spacing: Node spacing (dx, dy) [mm].
         gain: Indentation per pressure of every cosine mode [mm/MPa].
         softness: Local indentation over that of the mean thickness [-].
-        precision: Of the measured surface at the nodes [1/mm²].
+        precision: Precision of the measured surface at the nodes [1/mm²].
     """
 
     prior: AbstractPrior
@@ -69,10 +69,10 @@ class LayerNormal(eqx.Module):
     precision: Float[Array, "*maps my mx"]
 
     def __call__(self, gradient: Nodes) -> Nodes:
-        """Multiply with the inverse, to 1e-3."""
-        held = jnp.asarray(self.prior.penalised(gradient.shape)) ** 2
+        """Compute the product with the inverse, to 1e-3."""
+        weight = jnp.asarray(self.prior.mode_weight(gradient.shape)) ** 2
         spread = self.prior.mode_std(wave_numbers(gradient.shape, self.spacing), self.spacing)
-        diagonal = held + (spread * self.gain) ** 2 * jnp.mean(self.softness**2 * self.precision)
+        diagonal = weight + (spread * self.gain) ** 2 * jnp.mean(self.softness**2 * self.precision)
 
         def indented(white):
             return indentation(self.gain, self.softness, self.prior.expand(white, self.spacing))
@@ -80,7 +80,7 @@ class LayerNormal(eqx.Module):
         _, pull = jax.vjp(indented, jnp.zeros_like(gradient))
 
         def multiply(white):
-            return held * white + pull(self.precision * indented(white))[0]
+            return weight * white + pull(self.precision * indented(white))[0]
 
         return jax.scipy.sparse.linalg.cg(
             multiply, gradient, tol=_RTOL, atol=0.0, maxiter=_STEPS, M=lambda r: r / diagonal
@@ -88,7 +88,7 @@ class LayerNormal(eqx.Module):
 
 
 class FitNormal(eqx.Module):
-    """The preconditioner of a whole fit; calling it with the Jacobian J makes that of JᵀJ.
+    """Preconditioner of a fit, fitted numbers included; a call with the Jacobian J returns that of JᵀJ.
 
     Attributes:
         maps: One `LayerNormal` per map, stacked.
@@ -97,18 +97,18 @@ class FitNormal(eqx.Module):
     maps: LayerNormal
 
     def __call__(self, J: Any) -> "Preconditioner":
-        """Add fitted numbers, by products with J: two forward and one transposed for each."""
+        """Add the coarse space of fitted numbers, at two forward and one transposed product each."""
         whole = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), J.in_structure())
         names = list(whole.numbers)
         if not names:
             return Preconditioner(self.maps, None, None)
         maps = Preconditioner(self.maps, None, None)
 
-        # What change of the tractions a number calls for, and what both do together.
+        # A change of the number, with the change of the tractions that compensates it to first order.
         def direction(name):
             alone = whole._replace(numbers={**whole.numbers, name: jnp.ones(())})
-            followed = maps(J.T.mv(J.mv(alone)))
-            z = plus(alone, followed._replace(numbers=whole.numbers), -1.0)
+            compensation = maps(J.T.mv(J.mv(alone)))
+            z = plus(alone, compensation._replace(numbers=whole.numbers), -1.0)
             return z, J.mv(z)
 
         directions, images = jax.tree.map(lambda *v: jnp.stack(v), *(direction(name) for name in names))
@@ -120,8 +120,8 @@ class Preconditioner(eqx.Module):
 
     Attributes:
         maps: One `LayerNormal` per map, stacked.
-        directions: Of fitted numbers, with what the tractions do about them, stacked; None without.
-        coarse: Inverse of the normal matrix between these.
+        directions: Basis of the coarse space, one direction per fitted number, stacked; None without.
+        coarse: Inverse of the Galerkin normal matrix of the coarse space.
     """
 
     maps: LayerNormal
@@ -130,7 +130,7 @@ class Preconditioner(eqx.Module):
 
     @QuickJit
     def __call__(self, gradient: Unknowns) -> Unknowns:
-        """Multiply with the inverse."""
+        """Compute the product with the inverse."""
 
         def one(gain, softness, precision, part):
             return LayerNormal(self.maps.prior, self.maps.spacing, gain, softness, precision)(part)
@@ -150,16 +150,17 @@ def _inverse_gram(images: Any) -> Float[Array, "numbers numbers"]:
 
 
 @QuickJit
-def fit_normal(palpation: Palpation, observations: Observation, prior: AbstractPrior) -> FitNormal:
-    """Build the preconditioner of a fit from its stacked observations."""
+def fit_normal(palpation: Palpation, surfaces: MeasuredSurface, prior: AbstractPrior) -> FitNormal:
+    """Build the preconditioner of a fit from its stacked measured surfaces."""
     mesh = palpation.mesh()
 
-    def one(observation):
-        pressed = observation.surface / jnp.mean(observation.surface)
-        softness = jnp.clip(pressed, 0.1, 10.0) ** 3
-        return _gain(palpation, jnp.mean(observation.surface)), softness, observation.precision
+    def one(measured):
+        relative = measured.surface / jnp.mean(measured.surface)
+        # A layer thin against the wavelength indents with the cube of its thickness.
+        softness = jnp.clip(relative, _THINNEST, _THICKEST) ** 3
+        return _gain(palpation, jnp.mean(measured.surface)), softness, measured.precision
 
-    return FitNormal(LayerNormal(prior, mesh.spacing, *jax.vmap(one)(observations)))
+    return FitNormal(LayerNormal(prior, mesh.spacing, *jax.vmap(one)(surfaces)))
 
 
 def _gain(palpation: Palpation, thickness: Array) -> Float[Array, "my mx"]:

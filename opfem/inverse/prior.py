@@ -1,25 +1,29 @@
-"""What is known of the traction before it is measured: priors on the interface's nodes.
+"""Gaussian priors of a traction component at the nodes of the interface.
 
-A prior turns white noise into tractions, `mean + expand(white)`: what is fitted is the white noise, so that the prior
-itself costs nothing and its preconditioner is at hand. All of it by cosine transforms, O(n log n).
+A prior maps white noise to tractions, `mean + expand(white)`, by cosine transforms in O(n log n). A fit determines the
+white noise: the prior's covariance is then the identity, and its inverse costs nothing.
 """
 
 import itertools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.scipy.fft
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._checks import Leaf, check_finite, check_positive
+from .._checks import Leaf, check_finite, check_positive, concrete
 from .._types import ScalarLike
-from .transfer import wave_numbers
 
 Nodes = Float[Array, "my mx"]
 Spacing = tuple[ScalarLike, ScalarLike]
-# How firmly a prior holds what it says nothing of, over what it holds: its standard deviation is as much larger.
-_HARDLY = 1e-3
+# Weight of the prior's null space relative to its penalised modes: it makes an improper prior proper, with a standard
+# deviation a thousand times that of the longest wave.
+_NULL_SPACE_WEIGHT = 1e-3
+# Limit of BFGS steps in the search for Matérn hyper-parameters, two unknowns.
+_MAX_STEPS = 200
 
 
 def cosine_transform(values: Nodes) -> Nodes:
@@ -32,8 +36,16 @@ def from_cosines(modes: Nodes) -> Nodes:
     return jax.scipy.fft.idctn(modes, norm="ortho")
 
 
+def wave_numbers(shape: tuple[int, ...], spacing: tuple[ScalarLike, ScalarLike]) -> Float[Array, "my mx"]:
+    """Compute the wave number [1/mm] of every mode of a two-dimensional cosine transform on nodes."""
+    (my, mx), (hx, hy) = shape, spacing
+    ky = jnp.pi * jnp.arange(my) / (my * hy)
+    kx = jnp.pi * jnp.arange(mx) / (mx * hx)
+    return jnp.sqrt(ky[:, None] ** 2 + kx**2)
+
+
 class AbstractPrior(eqx.Module):
-    """A Gaussian prior on one traction component at the nodes of the interface [MPa]."""
+    """Prior of one traction component at the nodes of the interface [MPa]."""
 
     mean: eqx.AbstractVar[Array | None]
 
@@ -42,37 +54,73 @@ class AbstractPrior(eqx.Module):
         raise NotImplementedError
 
     def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Nodes | Array:
-        """Compute what nodal values are multiplied with after the cosine transform [-]."""
+        """Compute the factor of nodal values after the cosine transform [-]."""
         raise NotImplementedError
 
-    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Tell how firmly the prior holds white unknowns near zero: 1, or `_HARDLY` where it says nothing."""
+    def mode_weight(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the prior's weight of every mode: 1, and 1e-3 in its null space."""
         return np.ones(shape)
 
-    def held(self, white: Nodes, spacing: Spacing) -> Array:
-        """Compute what the prior holds near zero, standardised: half its sum of squares is the prior's energy."""
+    def residual(self, white: Nodes, spacing: Spacing) -> Array:
+        """Compute the standardised residual: half its sum of squares is the negative log-density, up to a constant."""
         del spacing
-        return jnp.asarray(self.penalised(white.shape)) * white
+        return jnp.asarray(self.mode_weight(white.shape)) * white
+
+    def scaled(self, factor: float | Array) -> "AbstractPrior":
+        """Return this prior with its standard deviation multiplied by a factor."""
+        raise NotImplementedError
+
+    def log_normaliser(self, shape: tuple[int, ...], spacing: Spacing) -> Array:
+        """Compute half the log-determinant of the covariance: sum of the logarithms of mode deviations and factors."""
+        modes = jnp.sum(jnp.log(self.mode_std(wave_numbers(shape, spacing), spacing)))
+        return modes + jnp.sum(jnp.log(jnp.broadcast_to(self.scale(shape, spacing), shape)))
+
+    def maximum_likelihood(
+        self, deviations: Float[Array, "samples my mx"], spacing: Spacing, extent: Array
+    ) -> tuple["AbstractPrior", float]:
+        """Compute the hyper-parameters of maximum likelihood for samples: the M step of expectation–maximisation.
+
+        Args:
+            deviations: Samples of the posterior minus the prior's mean [MPa].
+            spacing: Node spacing (dx, dy) [mm].
+            extent: Extent of the layer [mm], the largest correlation length.
+
+        Returns:
+            The prior, and the largest change of the logarithm of a hyper-parameter.
+
+        Raises:
+            ValueError: For a prior whose normalising constant is unknown.
+
+        Source:
+            Dempster, Laird & Rubin, J. R. Stat. Soc. B 39 (1977) 1.
+        """
+        del deviations, spacing, extent
+        raise ValueError(
+            f'fit_traction(hyperparameters="evidence") needs Matern(...) or Tikhonov(...), got {type(self).__name__}: '
+            'the normalising constant of its density is unknown. Use "discrepancy".'
+        )
+
+    def check_resolved(self, spacing: Spacing) -> None:
+        """Raise ValueError where the mesh cannot resolve the prior's correlation length; without one, do nothing."""
 
     def expand(self, white: Nodes, spacing: Spacing) -> Nodes:
-        """Turn white unknowns into deviations from the mean [MPa]."""
+        """Map white unknowns to deviations from the mean [MPa]."""
         k = wave_numbers(white.shape, spacing)
         modes = self.mode_std(k, spacing) * white
         return self.scale(white.shape, spacing) * from_cosines(modes)
 
     def whiten(self, deviation: Nodes, spacing: Spacing) -> Nodes:
-        """Turn deviations from the mean into white unknowns: the inverse of `expand`, but for waves it excludes."""
+        """Map deviations from the mean to white unknowns: the inverse of `expand`, but for modes of no variance."""
         std = self.mode_std(wave_numbers(deviation.shape, spacing), spacing)
         modes = cosine_transform(deviation / self.scale(deviation.shape, spacing))
         return jnp.where(std > 0, modes / jnp.where(std > 0, std, 1.0), 0.0)
 
 
 class Matern(AbstractPrior):
-    """A Matérn field: of one standard deviation everywhere, correlated over a length.
+    """A Matérn field of uniform standard deviation.
 
-    Points d apart correlate by (1 + √3 d/length) exp(-√3 d/length) at the default smoothness. Within a
-    length of the edges points correlate more, as if the field were mirrored there; the standard
-    deviation stays.
+    The correlation at distance d is (1 + √3 d/length) exp(-√3 d/length) at the default smoothness. Within a length of
+    the edges it is larger, as for a field mirrored there; the standard deviation is the same.
 
     Args:
         length: Correlation length [mm].
@@ -110,23 +158,60 @@ class Matern(AbstractPrior):
         return self.std * jnp.sqrt(density * k.size / jnp.sum(density))
 
     def scale(self, shape: tuple[int, ...], spacing: Spacing) -> Nodes:
-        """Compute what nodal values are multiplied with, so that all have the same standard deviation [-]."""
+        """Compute the factor of nodal values that makes their standard deviation uniform [-]."""
         variance = self.mode_std(wave_numbers(shape, spacing), spacing) ** 2
         for axis in (0, 1):
             squares = jnp.asarray(_squared_cosines(shape[axis]))
             variance = jnp.moveaxis(jnp.tensordot(squares, variance, ((1,), (axis,))), 0, axis)
         return self.std / jnp.sqrt(variance)
 
+    def scaled(self, factor: float | Array) -> "Matern":
+        """Return this prior with its standard deviation multiplied by a factor."""
+        return eqx.tree_at(lambda p: p.std, self, self.std * factor)
+
+    def maximum_likelihood(
+        self, deviations: Float[Array, "samples my mx"], spacing: Spacing, extent: Array
+    ) -> tuple["Matern", float]:
+        """Compute std and length of maximum likelihood, the length between an element and the layer."""
+        shape = deviations.shape[1:]
+        shortest, longest = jnp.max(jnp.stack(spacing)), jnp.max(extent)
+
+        def changed(x):
+            length = shortest + (longest - shortest) * jax.nn.sigmoid(x[1])
+            return eqx.tree_at(lambda p: (p.std, p.length), self, (self.std * jnp.exp(x[0]), length))
+
+        def negative_log_likelihood(x, _):
+            candidate = changed(x)
+            white = jax.vmap(lambda d: candidate.whiten(d, spacing))(deviations)
+            return 0.5 * jnp.mean(jnp.sum(white**2, axis=(1, 2))) + candidate.log_normaliser(shape, spacing)
+
+        share = jnp.clip((self.length - shortest) / (longest - shortest), 1e-3, 1.0 - 1e-3)
+        start = jnp.stack([jnp.zeros(()), jnp.log(share / (1.0 - share))])
+        search = optx.BFGS(1e-5, 1e-5)
+        found = optx.minimise(negative_log_likelihood, search, start, max_steps=_MAX_STEPS, throw=False).value
+        chosen = changed(found)
+        change = jnp.maximum(jnp.abs(jnp.log(chosen.std / self.std)), jnp.abs(jnp.log(chosen.length / self.length)))
+        return chosen, float(change)
+
+    def check_resolved(self, spacing: Spacing) -> None:
+        """Raise ValueError where the correlation length is below the size of an element."""
+        length, size = concrete(self.length), concrete(jnp.stack(spacing).max())
+        if length is not None and size is not None and np.any(length < size):
+            raise ValueError(
+                f"Matern.length [mm] must be at least an element, {float(size):g}, got {float(length):g}: the mesh "
+                "cannot resolve it. Pass a longer length, or Palpation(elements=...) with more."
+            )
+
 
 class Tikhonov(AbstractPrior):
     """A penalty on slopes or curvature: weight² ∫ |∇^order p|² over the interface.
 
-    It says nothing of the mean pressure.
+    Its null space is the mean pressure.
 
     Args:
         order: 1: slopes, 2: curvature.
         weight: Square root of the penalty's factor [mm^(order-1)/MPa].
-        mean: What differences are taken from, a number or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
+        mean: Reference of the penalised deviation, a number or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
 
     Raises:
         ValueError: If the order is neither 1 nor 2, or the weight is not positive.
@@ -144,7 +229,7 @@ class Tikhonov(AbstractPrior):
             check_finite("Tikhonov.mean", "MPa", self.mean)
 
     def mode_std(self, k: Nodes, spacing: Spacing) -> Nodes:
-        """Compute the standard deviation of every orthonormal cosine mode [MPa]; of the free one, a large number."""
+        """Compute the standard deviation of every orthonormal cosine mode [MPa]; of the null space, the largest one."""
         hx, hy = spacing
         lowest = jnp.min(jnp.where(k > 0, k, jnp.inf))
         unit = 1.0 / (self.weight * jnp.sqrt(hx * hy))
@@ -154,23 +239,36 @@ class Tikhonov(AbstractPrior):
         """Compute what nodal values are multiplied with: 1."""
         return jnp.ones(())
 
-    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Tell how firmly the prior holds white unknowns near zero: all but the mean."""
-        held = np.ones(shape)
-        held[0, 0] = _HARDLY
-        return held
+    def mode_weight(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the prior's weight of every mode: 1, and 1e-3 of the mean."""
+        weight = np.ones(shape)
+        weight[0, 0] = _NULL_SPACE_WEIGHT
+        return weight
+
+    def scaled(self, factor: float | Array) -> "Tikhonov":
+        """Return this prior with its standard deviation multiplied by a factor."""
+        return eqx.tree_at(lambda p: p.weight, self, self.weight / factor)
+
+    def maximum_likelihood(
+        self, deviations: Float[Array, "samples my mx"], spacing: Spacing, extent: Array
+    ) -> tuple["Tikhonov", float]:
+        """Compute the weight of maximum likelihood, in closed form; the mean, in the null space, does not count."""
+        del extent
+        white = jax.vmap(lambda d: self.whiten(d, spacing))(deviations)
+        factor = jnp.sqrt(jnp.sum(white.at[:, 0, 0].set(0.0) ** 2) / (white.size - white.shape[0]))
+        return self.scaled(factor), float(jnp.abs(jnp.log(factor)))
 
 
 class TotalVariation(AbstractPrior):
-    """A penalty on edges by their height, not their steepness: weight ∫ (√(|∇p|² + slope²) - slope) over the interface.
+    """Smoothed total variation, which preserves edges: weight ∫ (√(|∇p|² + slope²) - slope) over the interface.
 
-    Smooth below `slope`, where it is `Tikhonov(1, √(weight/slope))`. It says nothing of the mean pressure. Its
-    posterior is that of the quadratic penalty which touches it at the optimum.
+    Below `slope` it is `Tikhonov(1, √(weight/slope))`. Its null space is the mean pressure. Its posterior is that of
+    its quadratic approximation at the optimum.
 
     Args:
         weight: Factor of the penalty [1/(MPa mm)].
         slope: Gradient of the pressure above which it counts as an edge [MPa/mm].
-        mean: What differences are taken from, a number or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
+        mean: Reference of the penalised deviation, a number or interface nodes `(ny+1, nx+1)` [MPa]; None: zero.
 
     Raises:
         ValueError: If the weight or the slope is not positive.
@@ -199,28 +297,32 @@ class TotalVariation(AbstractPrior):
         """Compute what nodal values are multiplied with: 1."""
         return jnp.ones(())
 
-    def penalised(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Tell how firmly the prior holds white unknowns near zero where the pressure is smooth: all but the mean."""
-        return self._smooth.penalised(shape)
+    def mode_weight(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the prior's weight of every mode: 1, and 1e-3 of the mean."""
+        return self._smooth.mode_weight(shape)
 
-    def held(self, white: Nodes, spacing: Spacing) -> tuple[Array, Array]:
-        """Compute slopes, standardised so that half their sum of squares is the penalty; and what holds the mean."""
+    def scaled(self, factor: float | Array) -> "TotalVariation":
+        """Return this prior with the standard deviation of smooth pressure multiplied by a factor."""
+        return eqx.tree_at(lambda p: p.weight, self, self.weight / factor**2)
+
+    def residual(self, white: Nodes, spacing: Spacing) -> tuple[Array, Array]:
+        """Compute slopes, standardised so that half their sum of squares is the penalty; and the mean's residual."""
         hx, hy = spacing
         p = self.expand(white, spacing)
         along_x, along_y = (p[:, 1:] - p[:, :-1]) / hx, (p[1:] - p[:-1]) / hy
-        # Of each element every corner with its two edges: differences across it would not see a checkerboard.
+        # Slopes at all four corners of an element: a checkerboard is in the null space of slopes at its centre.
         edges = itertools.product((along_x[:-1], along_x[1:]), (along_y[:, :-1], along_y[:, 1:]))
         slopes = jnp.stack([jnp.stack(pair) for pair in edges])
         length = jnp.sqrt(jnp.sum(slopes**2, axis=1, keepdims=True) + self.slope**2)
         factor = jnp.sqrt(0.5 * self.weight * hx * hy / (length + self.slope))
-        return factor * slopes, _HARDLY * white[0, 0]
+        return factor * slopes, _NULL_SPACE_WEIGHT * white[0, 0]
 
 
 def on_nodes(prior: AbstractPrior, shape: tuple[int, ...]) -> Array:
-    """Spread the prior's mean over the interface's nodes [MPa], of both components where it is of a lateral traction.
+    """Broadcast the prior's mean to the interface's nodes [MPa]; of a lateral traction, to both components.
 
     Raises:
-        ValueError: If it is a map of another shape.
+        ValueError: If the mean has another shape.
     """
     mean = jnp.zeros(()) if prior.mean is None else prior.mean
     if mean.ndim and mean.shape != shape:
@@ -232,7 +334,7 @@ def on_nodes(prior: AbstractPrior, shape: tuple[int, ...]) -> Array:
 
 
 def _squared_cosines(n: int) -> np.ndarray:
-    """Square the orthonormal cosines: by node and mode."""
+    """Compute the squared orthonormal cosines by node and mode."""
     i = np.arange(n)
     cosines = np.cos(np.pi * (i[:, None] + 0.5) * i / n) * np.sqrt(2.0 / n)
     cosines[:, 0] = np.sqrt(1.0 / n)

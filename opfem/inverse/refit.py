@@ -1,4 +1,4 @@
-"""The fitted traction as a differentiable function of what it was fitted to."""
+"""The fitted traction as a differentiable function of map and prior, by the implicit function theorem."""
 
 import functools
 import operator
@@ -11,18 +11,17 @@ from jaxtyping import Array, Float
 
 from .._checks import concrete
 from ..measurement import ThicknessMap
-from .misfit import Misfit, carried
-from .noise import noise_std
-from .observation import observe
-from .posterior import Posterior
+from .measured_surface import noise_std, project_map
+from .objective import Objective, normal_traction
 from .preconditioner import Unknowns
 from .prior import AbstractPrior
 from .result import TractionFit
+from .uncertainty import Posterior
 
-# Relative gradient at which the optimum counts as found again, and most steps towards it.
+# Relative gradient of the converged optimum, and limit of steps.
 _RTOL = 1e-7
 _MOST_STEPS = 30
-# Relative residual of the linear systems that a derivative needs, and most iterations.
+# Relative residual of the linear system of a derivative, and limit of CG iterations.
 _DERIVATIVE_RTOL = 1e-6
 _DERIVATIVE_STEPS = 200
 
@@ -30,10 +29,11 @@ _DERIVATIVE_STEPS = 200
 def refitted(
     fit: TractionFit, thickness: ThicknessMap | None = None, prior: AbstractPrior | None = None
 ) -> Float[Array, "my mx"]:
-    """Find the optimum again under slightly other data or another prior, differentiably.
+    """Update a fit to slightly changed data or prior, differentiably.
 
-    It goes on from a fit by exact gradients; derivatives come from the implicit function at the optimum, forward and
-    reverse, second derivatives of the layer's response included. Works under `jit`, `grad` and `jvp`.
+    Newton steps with exact gradients continue from the fit. Derivatives follow from the implicit function theorem at
+    the optimum, second derivatives of the layer's response included, forward and reverse. Works under `jit`, `grad`
+    and `jvp`.
 
     Args:
         fit: A fit of one map.
@@ -41,28 +41,28 @@ def refitted(
         prior: The prior, of the same kind; None: that of the fit.
 
     Returns:
-        Normal traction per reference area [MPa]; NaN where it was not found again.
+        Normal traction per reference area [MPa]; NaN where the iteration did not converge.
     """
-    misfit = fit.misfit
+    objective = fit.objective
     if thickness is not None:
-        model_std = misfit.observations.model_std[0]
-        one = observe(misfit.palpation.mesh(), thickness, noise_std("refitted", thickness), model_std)
-        misfit = eqx.tree_at(lambda m: m.observations, misfit, jax.tree.map(lambda leaf: leaf[None], one))
+        model_std = objective.surfaces.model_std[0]
+        one = project_map(objective.palpation.mesh(), thickness, noise_std("refitted", thickness), model_std)
+        objective = eqx.tree_at(lambda m: m.surfaces, objective, jax.tree.map(lambda leaf: leaf[None], one))
     if prior is not None:
-        misfit = eqx.tree_at(lambda m: m.prior, misfit, prior)
-    # The preconditioner's prior is the fit's: that only has to be near.
+        objective = eqx.tree_at(lambda m: m.prior, objective, prior)
+    # The preconditioner has the fit's prior, which is close enough.
     posterior = _frozen(fit.posterior)
-    asked = fit.misfit.asked(posterior.white)
-    start = misfit.white(asked)._replace(lateral=posterior.white.lateral, numbers=posterior.white.numbers)
-    white = _optimum(misfit, posterior, _frozen(start))
-    if concrete(misfit.bed.stiffness) == 0.0:  # a dead load: what is asked for is carried, without another solve
-        return misfit.asked(white)[0]
-    return carried(misfit(white))[0]
+    applied = fit.objective.applied(posterior.white)
+    start = objective.white(applied)._replace(lateral=posterior.white.lateral, numbers=posterior.white.numbers)
+    white = _optimum(objective, posterior, _frozen(start))
+    if concrete(objective.foundation.stiffness) == 0.0:  # a dead load is transmitted unchanged: no solve is needed
+        return objective.applied(white)[0]
+    return normal_traction(objective(white))[0]
 
 
-def _optimum(misfit: Misfit, posterior: Posterior, start: Unknowns) -> Unknowns:
+def _optimum(objective: Objective, posterior: Posterior, start: Unknowns) -> Unknowns:
     """Find the optimum without derivatives, then take a Newton step: its derivative is the implicit function's."""
-    fixed = _frozen(misfit)
+    fixed = _frozen(objective)
 
     def closer(carry):
         white, g, count = carry
@@ -77,13 +77,13 @@ def _optimum(misfit: Misfit, posterior: Posterior, start: Unknowns) -> Unknowns:
     found = _size(g) <= _RTOL * _size(white)
     hessian = jax.linearize(lambda w: _gradient(fixed, w), white)[1]
     step, _ = jax.scipy.sparse.linalg.cg(
-        hessian, _gradient(misfit, white), tol=_DERIVATIVE_RTOL, maxiter=_DERIVATIVE_STEPS, M=posterior.precondition
+        hessian, _gradient(objective, white), tol=_DERIVATIVE_RTOL, maxiter=_DERIVATIVE_STEPS, M=posterior.precondition
     )
     return jax.tree.map(lambda w, s: jnp.where(found, w - s, jnp.nan), white, step)
 
 
-def _gradient(misfit: Misfit, white: Unknowns) -> Unknowns:
-    return jax.grad(lambda w: _half_squares(misfit(w)))(white)
+def _gradient(objective: Objective, white: Unknowns) -> Unknowns:
+    return jax.grad(lambda w: _half_squares(objective(w)))(white)
 
 
 def _frozen(tree: Any) -> Any:

@@ -1,6 +1,6 @@
-"""The arrays that a file of any accepted format holds, as the program that wrote them shows them.
+"""The arrays of a file of any accepted format, as the program that wrote them shows them.
 
-`read_thickness` chooses among them; nothing here knows what they mean. Each reader maps names to
+`read_thickness` chooses among them; their meaning is unknown here. Each reader maps names to
 `Entry`s; formats that name nothing use the empty name.
 """
 
@@ -18,7 +18,7 @@ from .tiff_files import list_tiff
 
 Result = TypeVar("Result")
 
-_MOST_SAID = 300  # characters of what a library says: some quote the damaged bytes
+_MOST_SAID = 300  # characters of a library's message: some quote the damaged bytes
 
 READERS: dict[str, Callable[[Reading], dict[str, Entry]]] = {
     ".mat": list_mat,
@@ -49,7 +49,7 @@ def read_arrays(
         max_bytes: Largest array to load, and largest text file to read.
         extent: (Lx, Ly) of the map [mm], where known: it settles what delimiters at the edge of a text leave open.
         spacing: (dx, dy) of the map [mm], where that is known instead.
-        notes: Gets what was odd, in words.
+        notes: Receives remarks for the user.
 
     Raises:
         MeasurementError: For a missing, empty or damaged file, and an unknown suffix.

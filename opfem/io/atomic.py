@@ -12,13 +12,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-# What file systems and platforms that cannot flush a folder, or open one, answer.
+# Errors of file systems and platforms that cannot flush, or open, a folder.
 _CANNOT_FLUSH = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 # Folders inside a folder of results, in the order in which a new result passes through them. In the first it is
 # written; once it has the second name it is complete, and the old files go; in the third it takes their place.
 _NEW, _COMPLETE, _MOVING, _OLD = ".opfem-new-", ".opfem-complete", ".opfem-moving", ".opfem-old"
-# A killed process leaves what it was writing. It takes seconds: what is older than this [s] is nobody's.
+# A killed process leaves temporary files. Writing takes seconds: files older than this [s] are abandoned.
 _STALE = 3600.0
 
 
@@ -110,7 +110,7 @@ def take_place(folder: Path, staged: Path, names: Iterable[str]) -> None:
 
 
 def finish(folder: Path, names: Iterable[str]) -> None:
-    """Complete what a killed process had begun with `take_place`; nothing, where there is nothing begun.
+    """Complete a `take_place` of a killed process, if there is one.
 
     Args:
         folder: Folder of the result, which need not exist.

@@ -43,7 +43,7 @@ class Checkpoint:
         """Replace the file by this state.
 
         Args:
-            inputs: What the solve was given.
+            inputs: Inputs of the solve.
             state: Any PyTree of arrays.
         """
         arrays: dict[str, Any] = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
@@ -54,7 +54,7 @@ class Checkpoint:
         """Read the state; None where there is no file.
 
         Args:
-            inputs: What the solve is given.
+            inputs: Inputs of the solve.
             like: A state of the same structure, shapes and types.
 
         Raises:

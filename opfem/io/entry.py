@@ -1,4 +1,4 @@
-"""One array of a file, as a listing tells it: what it is, and how to get it. Every format's reader makes them.
+"""One array of a file in a listing: its kind, and how to load it. Every format's reader makes them.
 
 Listing reads no numbers: a neighbour that is huge, damaged or no array costs nothing and spoils nothing.
 """
@@ -13,18 +13,18 @@ import numpy as np
 from ..measurement import MeasurementError
 
 MAX_BYTES = 2**29
-"""Largest array that is read unless told otherwise: 8000 by 8000 pixels in float64, above any OCT system's map."""
+"""Default limit of the size of an array: 8000 by 8000 pixels in float64, above any OCT system's map."""
 
 
 class Reading(NamedTuple):
-    """What a reader is asked, and where it leaves remarks.
+    """Arguments of a reader, and its remarks.
 
     Attributes:
         path: The file.
         max_bytes: Largest array to load.
         extent: (Lx, Ly) of the map [mm], where known: it settles what text leaves open.
         spacing: (dx, dy) of the map [mm], where that is known instead.
-        notes: What was odd, for the user; filled by readers.
+        notes: Remarks for the user; filled by readers.
     """
 
     path: Path
@@ -38,11 +38,11 @@ class Entry(NamedTuple):
     """One array of a file.
 
     Attributes:
-        kind: "numbers", or what it is instead, in words.
+        kind: "numbers", or a description of other contents.
         shape: Its shape, as the writing program shows it.
         load: Read it.
-        fields: List what a struct holds; None for what is no struct.
-        spacing: (dx, dy) between samples [mm], where the file tells it.
+        fields: Lists the fields of a struct; None for other arrays.
+        spacing: (dx, dy) between samples [mm], where the file states it.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Entry(NamedTuple):
 
 
 def other(kind: str, shape: tuple[int, ...] = (), fields: Callable[[], dict[str, Entry]] | None = None) -> Entry:
-    """List something that cannot be loaded as numbers; `kind` says what it is."""
+    """Make an entry that cannot be loaded as numbers; `kind` describes it."""
 
     def load() -> np.ndarray:
         raise MeasurementError(f"holds {kind}, no numbers.")
@@ -67,7 +67,7 @@ def damaged(cause: Exception) -> Entry:
 
 
 def kind_of(dtype: np.dtype) -> str:
-    """Say in words what an array of a type holds."""
+    """Describe the contents of an array of a type."""
     words = {"f": "numbers", "i": "numbers", "u": "numbers", "c": "complex numbers", "U": "text", "S": "text"}
     words |= {"b": "true/false values", "O": "a cell array or objects", "V": "a struct"}
     return words.get(dtype.kind, f"of type {dtype}")

@@ -19,7 +19,7 @@ _UNITS = {**LENGTH_UNITS, "millimeters": 1.0, "milimeters": 1.0, "microns": 1e-3
 
 
 def myoct_description(file: tifffile.TiffFile) -> dict[str, Any] | None:
-    """Read what myOCT says of a stack; None of other stacks."""
+    """Read myOCT's description of a stack; None for other stacks."""
     for tag in _TAGS:
         found = file.pages.first.tags.get(tag)
         text = found.value if found is not None else ""

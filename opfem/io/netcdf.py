@@ -1,6 +1,6 @@
 """Datasets of results to and from netCDF-4 files.
 
-Edge of the chain: what `to_xarray` labelled is stored with all its attributes, and comes back the same.
+Edge of the chain: a data set of `to_xarray` is stored with all its attributes, and read back unchanged.
 """
 
 import os
@@ -19,7 +19,7 @@ def write_netcdf(dataset: xr.Dataset, path: str | os.PathLike) -> None:
     """Write a dataset to a compressed netCDF-4 file, whole or not at all.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
         path: File to make or replace.
 
     Raises:
@@ -35,11 +35,11 @@ def netcdf_bytes(dataset: xr.Dataset) -> memoryview:
     """Encode a dataset as compressed netCDF-4 in memory; HDF5 itself crashes on a full disk.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
     """
     numeric = [name for name, values in dataset.variables.items() if values.ndim and values.dtype.kind in "fiub"]
     encoding = dict.fromkeys(numeric, _COMPRESSION)
-    # With a client of dask at work xarray would ask it for a lock named by the buffer, and fail.
+    # With an active dask client xarray would request a lock named by the buffer, and fail.
     dask = sys.modules.get("dask")
     with nullcontext() if dask is None else dask.config.set(scheduler="synchronous"):
         # What another file stored by is not how this one is to be stored.

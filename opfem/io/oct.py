@@ -156,7 +156,7 @@ def write_oct(volume: OctVolume | Spectra, path: str | os.PathLike) -> None:
 
 
 def _form(path: Path) -> str:
-    """Tell the format from the first bytes."""
+    """Detect the format by the first bytes."""
     if path.is_dir():
         return "thorlabs"
     if not path.is_file():
@@ -207,7 +207,7 @@ def _thorlabs(container: Container, quantity: str, variable, spacing, depth_spac
 
 
 def _stated(values: np.ndarray, spacing, depth_spacing, index_applied, scale, own: dict[str, Any]) -> OctVolume:
-    """Make a volume of an array by what the caller says of it."""
+    """Make a volume of an array with the caller's description."""
     if scale is None:
         raise MeasurementError(f"needs scale=, one of {', '.join(SCALES)}: {_guess(values)}.")
     if scale not in SCALES:
@@ -221,7 +221,7 @@ def _stated(values: np.ndarray, spacing, depth_spacing, index_applied, scale, ow
 
 
 def _of_myoct(values: np.ndarray, known: dict[str, Any], spacing, depth_spacing, index_applied, own) -> OctVolume:
-    """Make a volume in dB by what myOCT says of its grid, where the caller does not."""
+    """Make a volume in dB with myOCT's grid, unless the caller states one."""
     if spacing is None and None not in (known["dx"], known["dy"]):
         spacing = (known["dx"], known["dy"])
     if depth_spacing is None and known["dz"] is not None:
@@ -245,7 +245,7 @@ def _guess(values: np.ndarray) -> str:
 
 
 def _restated(volume: OctVolume, scale, own: dict[str, Any]) -> OctVolume:
-    """Take what the caller says over what the file says."""
+    """Prefer the caller's values to those of the file."""
     said = {name: value for name, value in own.items() if value is not None}
     if scale is None and not said:
         return volume
@@ -257,7 +257,7 @@ def _restated(volume: OctVolume, scale, own: dict[str, Any]) -> OctVolume:
 
 
 def _check_content(volume: OctVolume) -> None:
-    """Refuse a volume that holds nothing, by a sample of its A-lines."""
+    """Refuse an empty volume, by a sample of its A-lines."""
     rows, columns = profile_lattice(volume.shape)
     some = np.asarray(volume.values[rows, columns])
     missing = ~np.isfinite(some)

@@ -26,7 +26,7 @@ def write_hdf5(volume: OctVolume | Spectra, path: Path) -> None:
     in_one_piece = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     in_one_piece.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     in_one_piece.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    # From this version on HDF5 keeps checksums, which tell a damaged file.
+    # From this version on HDF5 stores checksums, which detect a damaged file.
     with h5py.File(path, "w", libver=("v108", "v110")) as file:
         data = file.create_dataset("values", values.shape, kind, chunks=(1, *values.shape[1:]), dcpl=in_one_piece)
         for row in range(values.shape[0]):
@@ -71,7 +71,7 @@ def _of_spectra(spectra: Spectra) -> dict[str, Any]:
 
 
 def own_volume(stored: Stored) -> OctVolume | None:
-    """Make a volume of what `write_hdf5` wrote; None of anything else."""
+    """Read a volume of `write_hdf5`; None for other files."""
     known = stored.attributes
     if _text(known.get("format")) != _VOLUME:
         return None
@@ -86,7 +86,7 @@ def own_volume(stored: Stored) -> OctVolume | None:
 
 
 def own_spectra(stored: Stored) -> Spectra | None:
-    """Make spectra of what `write_hdf5` wrote; None of anything else."""
+    """Read spectra of `write_hdf5`; None for other files."""
     known = stored.attributes
     if _text(known.get("format")) != _SPECTRA:
         return None

@@ -1,4 +1,4 @@
-"""OCT volumes in files that know nothing of OCT: raw numbers, .npy, HDF5, .mat and TIFF stacks.
+"""OCT volumes in general file formats: raw numbers, .npy, HDF5, .mat and TIFF stacks.
 
 The caller states what the file cannot: order of the axes, spacing, and what the numbers are. Arrays stay in the file
 where they lie there in one piece.
@@ -33,7 +33,7 @@ _COMPLEX = (np.dtype([("real", "<f4"), ("imag", "<f4")]), np.dtype([("real", "<f
 
 
 class Stored(NamedTuple):
-    """A 3-D array of a file, the fastest axis last, and what the file says of it."""
+    """A 3-D array of a file, the fastest axis last, with its attributes."""
 
     values: np.ndarray
     attributes: dict[str, Any]
@@ -128,7 +128,7 @@ def _place(data: h5py.Dataset, end: int) -> int | None:
 
 
 def _is_short(data: h5py.Dataset, name: str) -> bool:
-    """Tell whether an attribute is there and of fixed length: HDF5 reads damaged texts of variable length for ever."""
+    """Return whether an attribute exists with fixed length: HDF5 reads damaged texts of variable length for ever."""
     if name not in data.attrs:
         return False
     kind = data.attrs.get_id(name)

@@ -1,7 +1,7 @@
 """Stress–strain curves from load frames: text with or without header, .mat, .npz, .npy, HDF5.
 
-What can be read in two ways is refused with what to pass: sign, unit, columns. Force and position, where the file has
-them, are compared with its own stress and strain: they state the specimen's area and height.
+Ambiguous files are refused, with the argument that resolves them: sign, unit, columns. Force and position, where the
+file has them, are compared with its own stress and strain: they state the specimen's area and height.
 """
 
 import os
@@ -64,8 +64,8 @@ def read_stress_strain(
         kind: Whether the stress is "nominal" (over the initial area) or "true" (over the current one).
         mode: "uniaxial", "equibiaxial" or "planar".
         branch: "loading", "unloading", or the "mean" of both.
-        area: Initial area of the specimen [mm²]; compared with what the file says.
-        height: Its initial height [mm]; compared with what the file says.
+        area: Initial area of the specimen [mm²]; compared with that of the file.
+        height: Its initial height [mm]; compared with that of the file.
         std: Standard deviation of the stress [MPa].
         variable: Name of the array or struct, where a file holds several.
         max_bytes: Largest array to load.
@@ -251,10 +251,10 @@ def _array_series(entries: dict[str, Entry], columns: tuple[Column, ...]) -> tup
     """Take the columns of the only array of numbers."""
     tables = {name: entry for name, entry in entries.items() if entry.kind == "numbers" and len(entry.shape) == 2}
     if len(tables) != 1:
-        held = ", ".join(f"{name or 'array'} {entry.shape}" for name, entry in entries.items())
+        listed = ", ".join(f"{name or 'array'} {entry.shape}" for name, entry in entries.items())
         raise MeasurementError(
             f"holds no strain and stress by name, and {len(tables)} arrays of columns; pass variable= or columns= to "
-            f"name them. It holds {held or 'nothing'}."
+            f"name them. It holds {listed or 'nothing'}."
         )
     numbers = np.asarray(next(iter(tables.values())).load(), float)
     return _taken(numbers, columns, [""] * numbers.shape[1], None)

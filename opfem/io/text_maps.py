@@ -1,6 +1,6 @@
 """The map in a table of text: without header, index and coordinates, or put together from x, y, z triplets.
 
-Coordinates are told from thickness by their equal steps and their range; where both remain possible, or a row or
+Equal steps and the range distinguish coordinates from thickness; where both remain possible, or a row or
 column of nothing at the edge may be a delimiter too many, the given grid decides, or else the file is refused.
 """
 
@@ -129,7 +129,7 @@ def _without_index(table: Table) -> Table:
 
 
 def _triplets(table: Table, reading: Reading, names: list[str]) -> np.ndarray | None:
-    """Put x, y, z of points that fill a grid together to a map; None for what is no list of points."""
+    """Assemble x, y, z of points that fill a grid to a map; None for other tables."""
     if table.numbers.shape[1] != 3 or table.words or len(table.lines) < 4:
         return None
     x, y, z = table.numbers.T
@@ -166,7 +166,7 @@ def _positions(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _axes(table: Table, reading: Reading) -> tuple[Table, _Axis | None, _Axis | None] | None:
-    """Split coordinates of columns and rows off; None where the table holds thickness alone."""
+    """Separate coordinates of columns and rows; None where the table contains thickness only."""
     numbers = table.numbers
     if min(numbers.shape) < 2:
         return None
@@ -227,7 +227,7 @@ def _fits(reading: Reading, x: _Axis, y: _Axis) -> bool:
 
 
 def _check_spans(reading: Reading, x: _Axis | None, y: _Axis | None, shape: tuple[int, ...]) -> None:
-    """Hold coordinates against the given extent."""
+    """Compare coordinates with the given extent."""
     factors = _factors(reading, x, y)
     axis = x or y
     if not factors or axis is None or any(np.allclose(factors, unit, _SAME) for unit in _UNITS):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..measurement import MeasurementError
 
-# What Excel and LibreOffice write in cells without a value, in English, German, French, Spanish and Italian.
+# Text of Excel and LibreOffice in cells without a value, in English, German, French, Spanish and Italian.
 _SPREADSHEET = "#N/A #NV #N/D #NA #DIV/0! #¡DIV/0! #VALUE! #WERT! #VALEUR! #VALOR! #¡VALOR! #VALORE! #REF! #BEZUG! "
 _SPREADSHEET += "#¡REF! #RIF! #NUM! #ZAHL! #NOMBRE! #¡NUM! #NAME? #NOM? #NOMBRE? #¿NOMBRE? #NOME? #NULL! #NUL! #NULO!"
 _ERRORS = frozenset(_SPREADSHEET.split())
@@ -62,7 +62,7 @@ class Table(NamedTuple):
     Attributes:
         numbers: Their numbers; NaN where there is none.
         empty: True where nothing is written.
-        words: What is neither a number nor a missing value, by (row, column).
+        words: Cells that are neither numbers nor missing values, by (row, column).
         lines: Line number of each row.
     """
 
@@ -86,10 +86,10 @@ def read_table(path: Path, notes: list[str]) -> Table:
 
     Args:
         path: The file.
-        notes: Gets what was odd, in words.
+        notes: Receives remarks for the user.
 
     Raises:
-        MeasurementError: For what is no table of numbers, or can be read in two ways; names line and column.
+        MeasurementError: For a text that is no table of numbers, or ambiguous; names line and column.
     """
     text = _decoded(path.read_bytes())
     lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip(" ")]
@@ -134,7 +134,7 @@ def _is_comment(line: str) -> bool:
 
 
 def _delimiter(lines: list[str]) -> str:
-    """Find what separates cells: a tab or semicolon wherever there is one, else a comma, else spaces."""
+    """Find the delimiter of cells: a tab or semicolon wherever there is one, else a comma, else spaces."""
     for mark in "\t;":
         if any(mark in line for line in lines):
             return mark
@@ -276,7 +276,7 @@ def place(line: int, column: int) -> str:
 
 
 def not_a_number(table: Table, row: int, column: int) -> MeasurementError:
-    """Say that a cell holds words."""
+    """Make the error of a cell that contains words."""
     word = table.words[row, column]
     where = place(table.lines[row], column)
     if set(word) == {"#"}:

@@ -49,7 +49,7 @@ def read_thickness(
     but `path`. Only the array that is the map is loaded.
 
     Text may have header rows, an index, coordinates of rows and columns, decimal commas, or be x, y, z triplets
-    that fill a grid. What can be read in two ways is refused with line and column.
+    that fill a grid. Ambiguous texts are refused with line and column.
 
     Args:
         path: File to read.
@@ -70,7 +70,7 @@ def read_thickness(
         MeasurementError: For anything wrong with the file or its content; names the path and the cause.
 
     Warns:
-        MeasurementWarning: For what is odd and was read all the same.
+        MeasurementWarning: For anomalies of a file that was read.
     """
     path, notes = Path(path), []
     entries = read_arrays(path, max_bytes, _lengths(extent), _lengths(spacing), notes)
@@ -80,7 +80,7 @@ def read_thickness(
         extra = [name for name, value in given.items() if value is not None]
         if extra or unit != "mm":
             raise MeasurementError(
-                f"{path}: was written by opfem and knows its own grid; leave out {', '.join(extra) or 'unit'}."
+                f"{path}: was written by opfem and contains its grid; leave out {', '.join(extra) or 'unit'}."
             )
         return guarded(path, lambda: _restore(entries))
     size = _size_of_one(path, unit, scale)
@@ -163,7 +163,7 @@ def _restore(entries: dict[str, Entry]) -> ThicknessMap:
 
 
 def _lengths(value: Any) -> tuple[float, float] | None:
-    """Two lengths [mm], or None for what `ThicknessMap` refuses."""
+    """Two lengths [mm], or None for values that `ThicknessMap` refuses."""
     try:
         x, y = np.broadcast_to(np.asarray(value, dtype=float), 2).tolist()
     except (TypeError, ValueError):
@@ -195,7 +195,7 @@ def _fault(entry: Entry) -> str | None:
 
 
 def _listing(entries: dict[str, Entry]) -> str:
-    """Name what a file holds, and what its structs do."""
+    """List the arrays of a file, those in structs included."""
     listed = []
     for name, entry in entries.items():
         what = f"{name or 'array'} {entry.shape if entry.kind == 'numbers' else f'({entry.kind})'}"
@@ -219,7 +219,7 @@ def _named(entries: dict[str, Entry], variable: str) -> Entry | None:
 
 
 def _choose(path: Path, entries: dict[str, Entry], variable: str | None, notes: list[str]) -> Entry:
-    """Pick the array that is the map: the one asked for, or the only one that can be."""
+    """Pick the array that is the map: the requested one, or the only candidate."""
     odd = "".join(f"; {note}" for note in notes)
     if not entries:
         raise MeasurementError(f"{path}: the file holds no variable{odd}.")
@@ -258,7 +258,7 @@ def _loaded(path: Path, entry: Entry) -> np.ndarray:
 def _grid(
     path: Path, entry: Entry, shape: tuple[int, ...], extent: Any, spacing: Any, notes: list[str]
 ) -> tuple[Any, Any]:
-    """Settle (extent, spacing): as given, or as the file says."""
+    """Return (extent, spacing): as given, else those of the file."""
     if (extent is None) == (spacing is None):
         if extent is None and entry.spacing is not None:
             return None, entry.spacing

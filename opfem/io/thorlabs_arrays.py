@@ -1,4 +1,4 @@
-"""Volumes and raw spectra of an OCITY container, made of its arrays and what its header says of them.
+"""Volumes and raw spectra of an OCITY container, from its arrays and its header.
 
 Second step of reading a Thorlabs file, after `Container`; depths are kept as in air.
 """

@@ -1,6 +1,6 @@
 """Volumes and raw spectra as the OCITY containers that ThorImage reads: a ZIP file of uncompressed arrays.
 
-What OCITY has no place for (origin, sign of the phase, dispersion) stands in an element of its own under MetaInfo.
+Fields that OCITY lacks (origin, sign of the phase, dispersion) are in a separate element under MetaInfo.
 """
 
 import zipfile

@@ -20,7 +20,7 @@ from .entry import Entry, Reading, check_size, kind_of, other
 
 _UNITS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "micron": 1e-3, "microns": 1e-3, "mm": 1.0, "cm": 10.0}
 _UNITS |= {"millimeter": 1.0, "millimeters": 1.0, "m": 1e3, "inch": 25.4, "inches": 25.4, "in": 25.4}
-"""Units of length in ImageJ and OME files [mm]; what is not here, such as "pixel", tells no size."""
+"""Units of length in ImageJ and OME files [mm]; others, such as "pixel", are no length."""
 
 _PILLOW_MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
 _LONGEST_XML = 2**24

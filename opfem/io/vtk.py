@@ -28,7 +28,7 @@ def layer_grid(dataset: xr.Dataset) -> "pyvista.UnstructuredGrid":
     `bodies_grid` builds both bodies of an experiment.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
 
     Raises:
         ValueError: For a failed solution, which has no deformed layer.
@@ -51,7 +51,7 @@ def bodies_grid(dataset: xr.Dataset) -> "pyvista.UnstructuredGrid":
     `element_stress_MPa` and `shear_modulus_MPa` are those of the cells.
 
     Args:
-        dataset: What `to_xarray` returned for an experiment.
+        dataset: Result of `to_xarray` for an experiment.
 
     Raises:
         ValueError: For a failed solution, which has no deformed bodies.
@@ -85,7 +85,7 @@ def write_vtu(dataset: xr.Dataset, path: str | os.PathLike) -> None:
     """Write the deformed layer, of an experiment both bodies, to a .vtu file, whole or not at all.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
         path: File to make or replace; must end in .vtu.
 
     Raises:
@@ -99,7 +99,7 @@ def vtu_bytes(dataset: xr.Dataset) -> bytes:
     """Encode the deformed layer as a .vtu file in memory; VTK itself crashes on a full disk.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
 
     Raises:
         ValueError: For a failed solution, which has no deformed layer.
@@ -121,9 +121,9 @@ def write_pvd(datasets: Sequence[xr.Dataset], path: str | os.PathLike, times: Se
     The .pvd file comes last, so that it never lists a file that is not there.
 
     Args:
-        datasets: What `to_xarray` returned, for one state after the other.
+        datasets: Results of `to_xarray`, one per state.
         path: File to make or replace; must end in .pvd. The others are called `<stem>_000.vtu` and so on.
-        times: What ParaView shows as time, rising; None counts 0, 1, 2, …
+        times: Times for ParaView, rising; None: 0, 1, 2, …
 
     Raises:
         ValueError: For another suffix, no state, or times that do not rise or do not match.
@@ -165,10 +165,10 @@ def _hexahedra(points: Float[np.ndarray, "3 mz my mx"]) -> "pyvista.Unstructured
 def _point_arrays(
     dataset: xr.Dataset, displacement: Float[np.ndarray, "3 mz my mx"], body: str, faces: dict[str, bool]
 ) -> dict[str, np.ndarray]:
-    """Collect what is known at a body's nodes.
+    """Collect the nodal fields of a body.
 
     Args:
-        dataset: What `to_xarray` returned.
+        dataset: Result of `to_xarray`.
         displacement: Of the body's nodes [mm].
         body: Prefix of the body's names in the dataset.
         faces: Prefix of the names of each face that something touches, and whether it is the upper one.

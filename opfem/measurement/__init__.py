@@ -1,4 +1,4 @@
-"""Measured maps: what comes out of the microscope, before any mechanics."""
+"""Measured maps and curves, before any mechanics."""
 
 from .errors import MeasurementError, MeasurementWarning
 from .example import EXAMPLE_LAYER, example_map

@@ -1,7 +1,7 @@
-"""Checks of what a user hands to a `ThicknessMap`; each raises a `ValueError` that names the next step.
+"""Checks of the arguments of a `ThicknessMap`; each raises a `ValueError` that names the next step.
 
 Only concrete numbers can be checked: inside jit, grad and vmap the checks of values do nothing,
-those of shapes still hold. `piles` and `off_square` are for readers: what they find may be meant.
+those of shapes still apply. `piles` and `off_square` are for readers: their findings may be intended.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ _TOO_OFTEN = 10  # times the number of pixels that share any other number
 
 
 def check_map_shape(values: Any) -> None:
-    """Refuse what is not a 2-D array of at least 2 by 2 samples."""
+    """Raise ValueError unless values are a 2-D array of at least 2 by 2 samples."""
     if values.ndim != 2:
         raise ValueError(
             f"ThicknessMap.values [mm] must be 2-D (ny, nx), got shape {values.shape}; "
@@ -83,7 +83,7 @@ def doubtful_unit(thickness: np.ndarray) -> tuple[str, str, float] | None:
         thickness: Thickness that should be in mm, without masked pixels.
 
     Returns:
-        None when the range is plausible; else what the map spans, the guessed unit, and its size [mm].
+        None for a plausible range; else the range, the guessed unit, and its size [mm].
     """
     low, high = float(thickness.min()), float(thickness.max())
     if THINNEST <= high <= THICKEST:
@@ -124,14 +124,14 @@ def check_std(std: Any, mask: Any, shape: tuple[int, ...]) -> None:
 
 
 class Pile(NamedTuple):
-    """Pixels at the edge of a map's range that hold one number.
+    """Pixels at the edge of a map's range with one common value.
 
     Attributes:
         value: The number.
-        count: Pixels that hold it.
+        count: Number of these pixels.
         low: Lowest of the other numbers.
         high: Highest of them.
-        suspicion: What is odd, as in "far from the others".
+        suspicion: The anomaly, as in "far from the others".
         is_refused: Whether it cannot be thickness.
     """
 

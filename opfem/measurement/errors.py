@@ -2,7 +2,7 @@
 
 
 class MeasurementError(ValueError):
-    """A measured file is missing, damaged, ambiguous, or holds something else than a map."""
+    """A measured file is missing, damaged, ambiguous, or contains no map."""
 
 
 class MeasurementWarning(UserWarning):

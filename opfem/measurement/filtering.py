@@ -1,4 +1,4 @@
-"""Gaussian smoothing of a map, and what it does to the noise, as dense matrices along each axis.
+"""Gaussian smoothing of a map and of its noise, as dense matrices along each axis.
 
 `ThicknessMap.smoothed` is built on these. Matrices keep everything traceable, differentiable in the
 width, and exact at the edges, where a map continues at its edge value.

@@ -1,4 +1,4 @@
-"""The grid that a measurement lies on: samples at points, their spacing, origin and unit, and what is between them.
+"""Sampling grid of a measurement: spacing, origin and unit of its points, and interpolation between them.
 
 `ThicknessMap` and OCT volumes are both sampled on one, in x along image columns and y along image rows.
 """
@@ -103,7 +103,7 @@ def bilinear(
         values: Samples, indexed [y, x].
         origin: (x, y) of `values[0, 0]` [mm].
         spacing: Distance between samples (dx, dy) [mm].
-        x: Positions along image columns [mm]; outside the samples the edge value holds.
+        x: Positions along image columns [mm]; outside the samples the edge value continues.
         y: Positions along image rows [mm]; shape of `x`.
     """
     ny, nx = values.shape

@@ -30,7 +30,7 @@ def harmonic_fill(
     Differentiable in `values`, forward and reverse, at the cost of one solve each.
 
     Args:
-        values: Thickness [mm]; what stands in masked pixels has no influence.
+        values: Thickness [mm]; values of masked pixels have no influence.
         mask: True where `values` is not data.
         spacing: Distance between samples (dx, dy) [mm].
         max_iterations: Bound on conjugate-gradient iterations; None allows as many as the largest hole can need.

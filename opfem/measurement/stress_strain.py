@@ -39,8 +39,8 @@ class StressStrain(eqx.Module):
         rate: Median strain rate [1/s]; None without a time.
         mode: "uniaxial", "equibiaxial" or "planar" (pure shear); static.
         branch: "loading", "unloading" or their "mean"; static.
-        kind: "nominal" or "true": what the stress was read as; static.
-        steps: What was done to the curve so far, in order.
+        kind: "nominal" or "true": kind of stress in the file; static.
+        steps: Processing steps of the curve, in order.
 
     Example:
         >>> import numpy as np
@@ -84,13 +84,13 @@ class StressStrain(eqx.Module):
             nominal: Nominal stress [MPa], shape (n,).
             std: Standard deviation of the stress [MPa], a number or shape (n,).
             mode: "uniaxial", "equibiaxial" or "planar".
-            branch: What the points are.
-            kind: What the stress was read as; it is nominal here.
+            branch: Branch of the test.
+            kind: Kind of stress in the file; it is nominal here.
             area: Initial area [mm²] by the file.
             height: Initial height [mm] by the file.
             energy_loss: Energy loss of the cycle [-].
             rate: Strain rate [1/s].
-            steps: What was done before.
+            steps: Previous processing steps.
 
         Raises:
             ValueError: For shapes that do not match, and numbers out of range.
@@ -152,7 +152,7 @@ class StressStrain(eqx.Module):
 
 
 class Cycle(NamedTuple):
-    """Rows of a test by what they do.
+    """Rows of a test by branch.
 
     Attributes:
         loading: True where the size of the strain grows.
@@ -164,9 +164,9 @@ class Cycle(NamedTuple):
 
 
 def cycle_of(strain: Float[np.ndarray, " n"]) -> Cycle:
-    """Tell loading from unloading by the turning points of the strain; rest before the first ramp is neither.
+    """Separate loading from unloading by the turning points of the strain; rest before the first ramp is neither.
 
-    Rows that rest at a turning point count for what follows, so that a hold at the peak is no loading.
+    Rows at rest at a turning point belong to the following branch, so that a hold at the peak is no loading.
 
     Args:
         strain: Strain of every row [-], of either sign.

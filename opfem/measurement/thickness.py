@@ -25,10 +25,10 @@ _USED = 1e-6
 
 
 class Step(eqx.Module):
-    """One processing step of a map: what was done, and with which numbers.
+    """One processing step of a map: its name and its numbers.
 
     Attributes:
-        name: What was done; static.
+        name: Name of the step; static.
         numbers: Its numbers; leaves, so that maps with other numbers share one compilation.
     """
 
@@ -52,9 +52,9 @@ class ThicknessMap(AbstractGrid):
         std: Standard deviation of the noise [mm], one number or per pixel; None when not known.
         noise_length: FWHM [mm] of the Gaussian that would correlate white noise like this map's; 0 when white.
             Pixels d apart correlate by exp(-d²/(4 s²)), s = noise_length / 2.3548.
-        mask: True where the map holds no data. It stays when pixels are filled.
-        steps: What was done to the map so far, in order.
-        is_filled: Whether masked pixels hold a smooth fill; static.
+        mask: True for missing data. Filling does not change it.
+        steps: Processing steps of the map, in order.
+        is_filled: Whether masked pixels have a smooth fill; static.
 
     Example:
         >>> import jax.numpy as jnp
@@ -96,8 +96,8 @@ class ThicknessMap(AbstractGrid):
             std: Standard deviation of the noise [mm], one number or shape (ny, nx).
             mask: Bool, shape (ny, nx); True where `values` is not data.
             noise_length: FWHM [mm] that the noise is correlated by; 0 is white.
-            steps: What was done to the map before.
-            is_filled: Whether masked pixels of `values` hold a smooth fill.
+            steps: Previous processing steps of the map.
+            is_filled: Whether masked pixels of `values` have a smooth fill.
 
         Raises:
             ValueError: For a wrong shape; NaN, infinite, or unmasked non-positive thickness; a range that
@@ -106,7 +106,7 @@ class ThicknessMap(AbstractGrid):
         if isinstance(values, np.ma.MaskedArray):
             masked = np.ma.getmaskarray(values)
             mask = masked if mask is None else jnp.asarray(mask) | masked
-            values = values.filled(1.0)  # whatever they hold, NaN too, counts nowhere
+            values = values.filled(1.0)  # values of masked pixels, NaN included, are ignored
         self.values = as_leaf(values, "ThicknessMap.values", "mm")
         check_map_shape(self.values)
         shape, dtype = self.values.shape, self.values.dtype
@@ -268,7 +268,7 @@ class ThicknessMap(AbstractGrid):
         )
 
     def sample(self, x: Points, y: Points) -> Points:
-        """Interpolate the thickness bilinearly at any points; beyond the samples the edge value holds.
+        """Interpolate the thickness bilinearly at any points; beyond the samples the edge value continues.
 
         Args:
             x: Positions along image columns [mm].

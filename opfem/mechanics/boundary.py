@@ -1,8 +1,8 @@
-"""Where the layer touches rigid bodies: two faces, and the sides that may roll onto them.
+"""Contact boundary of the layer: two faces, and the sides that may fold onto the rigid bodies.
 
-A compressed layer bulges at its free sides, and a bulge folds onto the window or the sample: the
-lower half of the sides can touch the window, the upper half the sample. The sides are one strip of
-faces around the layer, seen from outside: south, east, north, west, its first node repeated last.
+A compressed layer bulges at its free sides, and a bulge folds onto window or sample: contact includes the lower half of
+the sides with the window, the upper half with the sample. The sides are one strip of faces around the layer, seen from
+outside: south, east, north, west, its first node repeated last.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ Corners = Float[Array, "4 c faces"]
 
 
 class Bodies(NamedTuple):
-    """One thing for each rigid body; None where the layer cannot touch it."""
+    """One value per rigid body; None for a body without contact."""
 
     window: Any = None
     sample: Any = None
 
     def map(self, function: Callable, *others: "Bodies") -> "Bodies":
-        """Apply a function to every body that is there, with its name first."""
+        """Apply a function to every body with contact, its name first."""
         return Bodies(
             *(
                 None if mine is None else function(body, mine, *rest)
@@ -39,7 +39,7 @@ class Bodies(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """Nodal values of all that may touch one body: the face, and its half of the sides or None."""
+    """Nodal values of all faces in contact with one body: the face, and its half of the sides or None."""
 
     face: Float[Array, "c my mx"]
     sides: Float[Array, "c rows columns"] | None
@@ -52,7 +52,7 @@ class Touching(NamedTuple):
 
 
 def take(u: Nodal, body: str, with_sides: bool) -> Corners:
-    """Take the nodal values at the corners of all faces that may touch a body, those of the sides last."""
+    """Gather nodal values at the corners of all faces in contact with a body, those of the sides last."""
     nodes = touched(u, body, with_sides)
     corners = gather_face(nodes.face).reshape(4, 3, -1)
     if nodes.sides is None:
@@ -61,7 +61,7 @@ def take(u: Nodal, body: str, with_sides: bool) -> Corners:
 
 
 def touched(u: Nodal, body: str, with_sides: bool) -> Touching:
-    """Take the nodal values of all that may touch a body."""
+    """Extract the nodal values of all faces in contact with a body."""
     face = u[:, _level(u.shape[1], body)]
     if not with_sides:
         return Touching(face, None)
@@ -71,7 +71,7 @@ def touched(u: Nodal, body: str, with_sides: bool) -> Touching:
 
 
 def to_touching(corners: Corners, elements: tuple[int, int, int]) -> Touching:
-    """Add corner values into nodes.
+    """Assemble corner values at nodes.
 
     Args:
         corners: Corner values, ordered as `take` does.
@@ -82,7 +82,7 @@ def to_touching(corners: Corners, elements: tuple[int, int, int]) -> Touching:
 
 
 def put(values: Touching, body: str, shape: tuple[int, ...]) -> Nodal:
-    """Add the nodal values of what touches a body into a zero nodal field."""
+    """Return a nodal field that is zero except for the nodal values of a body's faces."""
     mz, my, mx = shape[1:]
     whole = _placed(values.face[:, None], shape, z=_level(mz, body))
     if values.sides is None:
@@ -117,13 +117,13 @@ def add_matrices(K: Array, matrices: Float[Array, "4 4 3 3 faces"], body: str) -
 
 
 def is_side(elements: tuple[int, int, int]) -> np.ndarray:
-    """Tell which faces that `take` gives are sides, `(faces,)`."""
+    """Return which faces of `take` are sides, `(faces,)`."""
     nz, ny, nx = elements
     return np.arange(ny * nx + (nz + 1) // 2 * 2 * (nx + ny)) >= ny * nx
 
 
 def _split(values: Array, elements: tuple[int, int, int]) -> tuple[Array, Array | None]:
-    """Split values of all faces that may touch a body into the face's own and the sides', as grids."""
+    """Split values of all faces in contact with a body into those of its face and of the sides, as grids."""
     nz, ny, nx = elements
     face = values[..., : ny * nx].reshape(*values.shape[:-1], ny, nx)
     if values.shape[-1] == ny * nx:
@@ -136,7 +136,7 @@ def _level(n: int, body: str) -> int:
 
 
 def _layers(nz: int, body: str, nodes: bool) -> slice:
-    """Rows of the strip of sides that belong to a body: its own half of the layer."""
+    """Rows of the strip of sides in contact with a body: the half of the layer next to it."""
     half = (nz + 1) // 2
     first = 0 if body == "window" else nz - half
     return slice(first, first + half + nodes)

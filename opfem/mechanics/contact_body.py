@@ -1,4 +1,4 @@
-"""What a contact face meets: a rigid surface that moves with the load, or a pressure that is imposed."""
+"""Counterpart of a contact face: a rigid surface that moves with the load, or an imposed pressure."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ class RigidSurface(eqx.Module):
         return self.end is None
 
     def at(self, fraction: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Evaluate height [mm] and slopes [-] when a fraction of the motion is done."""
+        """Evaluate height [mm] and slopes [-] at a fraction of the motion."""
         d = self.derivatives(fraction, x, y, 1)
         return d[0, 0], d[0, 1], d[1, 0]
 
@@ -39,7 +39,7 @@ class RigidSurface(eqx.Module):
         return now.derivatives(x, y, order)
 
     def around(self, x: Array, y: Array) -> "RigidPatches | None":
-        """Collect what the surface is made of around points [mm]; None for the plane z = 0."""
+        """Gather the coefficients of the surface around points [mm]; None for the plane z = 0."""
         if self.start is None or self.end is None:
             return None
         return RigidPatches(self.start.around(x, y), self.end.around(x, y))
@@ -77,14 +77,14 @@ class RigidPatches(eqx.Module):
 
 
 class ImposedPressure(eqx.Module):
-    """A pressure per reference area that bounds friction: a dead one, applied elsewhere, and a bed of springs.
+    """Normal pressure per reference area that bounds friction: a dead load, applied elsewhere, and a foundation.
 
     Attributes:
         start: Dead pressure at the corners of the faces at load fraction 0 `(4, *faces)` [MPa].
-        end: The same at load fraction 1.
+        end: Dead pressure at load fraction 1.
         area: Reference area per unit of (ξ, η) at the points [mm²].
-        height: Of the points where the springs are at rest [mm]; None: there are no springs.
-        stiffness: Of the springs at load fractions 0 and 1 [MPa/mm].
+        height: Height of the points at which the foundation is at rest [mm]; None: no foundation.
+        stiffness: Foundation stiffness at load fractions 0 and 1 [MPa/mm].
     """
 
     start: Float[Array, "4 *faces"]
@@ -93,14 +93,14 @@ class ImposedPressure(eqx.Module):
     height: Float[Array, "points *faces"] | None = None
     stiffness: tuple[Array, Array] | None = None
 
-    def springs(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
-        """Compute the springs' pressure [MPa] at heights [mm]; negative where they pull."""
+    def foundation_pressure(self, fraction: Array, z: Float[Array, "points *faces"]) -> Float[Array, "points *faces"]:
+        """Compute the pressure of the foundation [MPa] at heights [mm]; negative in tension."""
         if self.height is None or self.stiffness is None:
             return jnp.zeros_like(z)
         start, end = self.stiffness
         return ((1.0 - fraction) * start + fraction * end) * (z - self.height)
 
-    def bounding(self, fraction: Array, rule: FaceRule, springs: Array | float) -> Float[Array, "points *faces"]:
-        """Compute the pressure [MPa] at the points with that of the springs; tension bounds friction by zero."""
+    def bounding(self, fraction: Array, rule: FaceRule, foundation: Array | float) -> Float[Array, "points *faces"]:
+        """Compute the pressure [MPa] at the points, the foundation's included; tension bounds friction by zero."""
         corners = (1.0 - fraction) * self.start + fraction * self.end
-        return jnp.maximum(contract(quadrature(rule).N, corners) + springs, 0.0)
+        return jnp.maximum(contract(quadrature(rule).N, corners) + foundation, 0.0)

@@ -1,9 +1,9 @@
 """Contact and friction of two deformable faces: points of the lower body's face against the upper body's.
 
-Each face point of the lower body is looked up along z on a smooth surface through the moving nodes of the upper body's
-face (`smooth_face`). Law and friction are those of a face against a rigid surface; the opposite force goes to the
-upper body's nodes by the weights of that surface, so that action and reaction are equal to rounding. Friction remembers
-material points of the upper body: rigid motion of both gives no slip.
+Each face point of the lower body is projected along z onto a smooth surface through the moving nodes of the upper
+body's face (`smooth_face`). Law and friction are those of a face against a rigid surface. The weights of that surface
+distribute the reaction to the upper body's nodes, so that action and reaction are equal to round-off. The friction
+history refers to material points of the upper body: rigid motion of both gives no slip.
 
 Source:
     Zimmerman and Ateshian, J. Biomech. Eng. 140 (2018) 081013 (ray tracing from face points).
@@ -18,33 +18,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .contact_face import ContactFace
 from .contact_state import ContactIterate, Corners, FacePoints, PointContact, SlipHistory, TangentLaw
 from .face import CORNERS, area_vector, quadrature, size, surface_tangents, to_corners
-from .interaction import ContactFace, positive_part
+from .friction import positive_part
 from .kinematics import contract
 from .smooth_face import BEYOND, Place, continued, mirrored, patch
 
-# Newton steps to find the place of a point, from where it would be had the upper face not moved.
+# Newton steps of the projection of a point, from its position on the undeformed upper face.
 _FINDING_STEPS = 6
-# Most stiffness of the upper body's contact springs in the preconditioner, over that of an element of the lower one
-# (its confined modulus over its height): the lower body is solved with all of its springs, then the upper one with
-# these, as if in series with a seventh of that element. In the other order the upper body's springs would have to be
-# right to a hundredth, and elements' matrices cannot hold those of the smooth surface. Krylov steps a Newton step of
-# the published ridged sample on 20×20×(2+8) elements, at 10, 28, 66 and 85 % of the load: 11, 17, 42 and 64 at 0.02;
-# 12, 15, 18 and 21 at 2; 12, 13, 16 and 18 at 7; 12, 14, 16 and 16 at 23, which needs 13 instead of 9 Newton steps to
-# the first contact.
+# Highest contact stiffness of the upper body in the preconditioner, over that of an element of the lower one (its
+# confined modulus over its height): the lower body is solved with the full contact stiffness, then the upper one with
+# this, as if in series with a seventh of that element. The reverse order requires the upper body's contact stiffness to
+# 1 %, and element matrices cannot represent that of the smooth surface. Krylov steps per Newton step of the published
+# ridged sample on 20×20×(2+8) elements, at 10, 28, 66 and 85 % of the load: 11, 17, 42 and 64 at 0.02; 12, 15, 18 and
+# 21 at 2; 12, 13, 16 and 18 at 7; 12, 14, 16 and 16 at 23, which needs 13 instead of 9 Newton steps to first contact.
 SOFT = 7.0
 
 UpperNodes = Float[Array, "3 my mx"]
 
 
 class PairPoints(NamedTuple):
-    """Where the points of the lower face are, and where they meet the upper face.
+    """Positions of the points of the lower face, and their projections onto the upper face.
 
     Attributes:
         at: The points, and the upper face's height and slope there.
-        place: The material point met, x and y, in cells of the upper face's grid.
-        overlap: Share of the point that the upper face reaches over [-]: 1 but at its rim.
+        place: Material point of the projection, x and y, in cells of the upper face's grid.
+        overlap: Share of the point that the upper face covers [-]: 1 except at its rim.
     """
 
     at: FacePoints
@@ -63,11 +63,11 @@ class ContactPair(eqx.Module):
     """Contact between the faces of two deformable bodies.
 
     Attributes:
-        face: Law, friction and quadrature of the lower face, which is above nothing: its rigid surface is not used.
-        spacing: Of the upper face's grid [mm].
-        lower_spacing: Of the lower face's grid [mm].
+        face: Law, friction and quadrature of the lower face; its rigid surface is not used.
+        spacing: Spacing of the upper face's grid [mm].
+        lower_spacing: Spacing of the lower face's grid [mm].
         rims: Whether the upper face ends at x0, x1, y0, y1; at a plane of symmetry it does not.
-        soft: Stiffness of the upper body's springs in the preconditioner [MPa/mm] (`SOFT`).
+        soft: Contact stiffness of the upper body in the preconditioner [MPa/mm] (`SOFT`).
     """
 
     face: ContactFace
@@ -77,14 +77,14 @@ class ContactPair(eqx.Module):
     rims: tuple[bool, bool, bool, bool] = eqx.field(static=True)
 
     def initial_history(self, x: Corners) -> SlipHistory:
-        """Build the history of faces that have not slipped."""
+        """Build the history of faces without slip."""
         history = self.face.initial_history(x)
         return eqx.tree_at(lambda h: h.position, history, self._unmoved(history.position))
 
     def locate(self, fraction: Array, x: Corners, upper: UpperNodes, history: SlipHistory) -> PairPoints:
-        """Find where the points of faces with corners x [mm] meet the face with nodes `upper` [mm].
+        """Project the points of faces with corners x [mm] onto the face with nodes `upper` [mm].
 
-        The search has no derivative; two Newton steps after it carry them, one order each.
+        The search has no derivative; two Newton steps after it provide first and second derivatives.
         """
         position, *tangents = surface_tangents(x, self.face.rule)
         surface = continued(upper, self.rims)
@@ -98,7 +98,7 @@ class ContactPair(eqx.Module):
         return PairPoints(at, place, self._overlap(place, upper))
 
     def at_points(self, points: PairPoints, history: SlipHistory, law: TangentLaw | None = None) -> PointContact:
-        """Evaluate contact at the points, with the contact's own law or a linearised one."""
+        """Evaluate contact at the points, by the nonlinear law or a linearised one."""
         return self.face.at_points(points.at, history, law)
 
     def area(self, points: PairPoints) -> Float[Array, "points *faces"]:
@@ -136,7 +136,7 @@ class ContactPair(eqx.Module):
     def guards(
         self, points: PairPoints, upper: UpperNodes, history: SlipHistory, law: TangentLaw | None
     ) -> tuple[Float[Array, "4 4 3 3 faces"], Float[Array, "4 4 3 3 upper_faces"]]:
-        """Compute the springs of each body's own preconditioner [N/mm], as matrices of its faces: lower, upper."""
+        """Compute the contact stiffness of each body's preconditioner [N/mm], as face matrices: lower, upper."""
         face, at = self.face, points.at
         clearance = face.clearance(at)
         own = face.own_law(history) if law is None else law
@@ -162,11 +162,11 @@ class ContactPair(eqx.Module):
     def follow(
         self, points: PairPoints, change: Corners, upper: UpperNodes, history: SlipHistory, law: TangentLaw
     ) -> ContactIterate:
-        """Compute what the next iteration remembers once a part of the step of both faces is taken."""
+        """Update the contact iterate after a part of the step of both faces."""
         at = points.at
         step = jnp.moveaxis(contract(quadrature(self.face.rule).N, change), 1, 0)
-        apart = patch(continued(upper, self.rims), points.place).at(points.place).position - step
-        opening = apart[2] - at.slope[0] * apart[0] - at.slope[1] * apart[1]
+        separation = patch(continued(upper, self.rims), points.place).at(points.place).position - step
+        opening = separation[2] - at.slope[0] * separation[0] - at.slope[1] * separation[1]
         clearance = self.face.clearance(at) + opening / at.stretch
         point = self.at_points(points, history, law)
         return ContactIterate(law.pressure, jnp.where(point.sliding, point.elastic, 0.0), law(clearance) - law.pressure)
@@ -188,10 +188,10 @@ class ContactPair(eqx.Module):
         return jax.lax.fori_loop(0, _FINDING_STEPS, closer, _clipped(self._unmoved(xy), surface))
 
     def _overlap(self, place: Place, upper: UpperNodes) -> Float[Array, "points *faces"]:
-        """Compute the share of each point that the upper face reaches over.
+        """Compute the share of each point that the upper face covers.
 
-        A point that slid off a rim at full pressure would make Newton's method alternate between two states for ever.
-        Bodies whose rims meet are not at the edge of that: there is a quarter of a point's width to spare.
+        Without it, a point that slides off a rim at full pressure makes Newton's method cycle between two states.
+        Bodies with coincident rims have a margin of a quarter of a point's width.
         """
         q = quadrature(self.face.rule)
         outermost = float(np.min(q.N @ np.array([x for x, _ in CORNERS])))
@@ -206,16 +206,16 @@ class ContactPair(eqx.Module):
         return share
 
     def _gathered(
-        self, place: Place, springs: Float[Array, "3 3 points faces"], upper: UpperNodes
+        self, place: Place, stiffness: Float[Array, "3 3 points faces"], upper: UpperNodes
     ) -> Float[Array, "4 4 3 3 upper_faces"]:
-        """Add the springs of points into the matrices of the upper body's faces, bilinear within them."""
+        """Assemble contact stiffness of points into face matrices of the upper body, bilinear within faces."""
         my, mx = upper.shape[1:]
         cell = patch(mirrored(upper), place).cell
         x, y = jnp.clip(place - cell, 0.0, 1.0)
         weights = jnp.stack([(x if i else 1.0 - x) * (y if j else 1.0 - y) for i, j in CORNERS])
-        each = weights[:, None, None, None] * weights[None, :, None, None] * springs
+        each = weights[:, None, None, None] * weights[None, :, None, None] * stiffness
         index = (cell[1] * (mx - 1) + cell[0]).reshape(-1)
-        whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), springs.dtype)
+        whole = jnp.zeros((4, 4, 3, 3, (my - 1) * (mx - 1)), stiffness.dtype)
         return whole.at[..., index].add(each.reshape(4, 4, 3, 3, -1))
 
 
@@ -224,10 +224,10 @@ def _clipped(place: Place, surface: Array) -> Place:
 
 
 def _is_near(place: Place, surface: Array) -> Array:
-    """Tell whether a search ended on the upper face, or just beside it."""
+    """Return whether a search ended on the upper face, or next to its rim."""
     return jnp.all((place > -BEYOND) & (place < _last(place, surface) + BEYOND), axis=0)
 
 
 def _last(place: Place, surface: Array) -> Array:
-    """Place of the last node along each axis, less the ghosts."""
+    """Place of the last node along each axis, without ghost nodes."""
     return jnp.asarray(np.array(surface.shape[:0:-1]).reshape(2, *[1] * (place.ndim - 1)) - 3.0, place.dtype)

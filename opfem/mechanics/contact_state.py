@@ -1,4 +1,4 @@
-"""What is known of contact at the points of faces: where they are, their history, and a Newton step's linear law.
+"""State of contact at face points: positions, friction history, and the linearised law of a Newton step.
 
 Fields carry their components first, then points, then faces; `interaction` computes and uses them.
 """
@@ -19,14 +19,14 @@ PointVector = Float[Array, "3 points *faces"]
 
 
 class SlipHistory(eqx.Module):
-    """What friction remembers at the end of an increment, per face point.
+    """Friction history at the end of an increment, per face point.
 
     Attributes:
         position: (x, y) of the points `(2, points, *faces)` [mm]; on a deformable body, its material points [cells].
         elastic: Elastic part of the slip `(2, points, *faces)` [mm].
-        slip: Slip slid so far, along x and y `(2, points, *faces)` [mm].
-        dissipated: Work done by friction so far on the whole face [N mm]; of each body where faces are paired.
-        pressure: Contact pressure at the points [MPa], where the next increment starts from.
+        slip: Plastic slip since the start, along x and y `(2, points, *faces)` [mm].
+        dissipated: Frictional dissipation of the whole face since the start [N mm]; of each body of paired faces.
+        pressure: Contact pressure at the points [MPa], initial guess of the next increment.
     """
 
     position: Float[Array, "2 points *faces"]
@@ -37,13 +37,12 @@ class SlipHistory(eqx.Module):
 
 
 class ContactIterate(NamedTuple):
-    """What a Newton iteration remembers of a face besides displacement.
+    """Contact iterate of a face: unknowns of Newton's method other than displacement.
 
     Attributes:
-        pressure: Contact pressure at the points [MPa], an unknown of its own.
-        direction: Slip that a sliding point had in the last step `(2, points, *faces)` [mm], zero
-            where it stuck.
-        change: What the step found, but not yet taken, changes the pressure by [MPa].
+        pressure: Contact pressure at the points [MPa], an independent unknown.
+        direction: Slip of a sliding point in the last step `(2, points, *faces)` [mm], zero for stick.
+        change: Pressure increment of the pending Newton step [MPa].
     """
 
     pressure: Float[Array, "points *faces"]
@@ -56,7 +55,7 @@ class ContactIterate(NamedTuple):
 
 
 def joined_histories(histories: Sequence[SlipHistory]) -> SlipHistory:
-    """Put the histories of several faces side by side."""
+    """Concatenate the histories of several faces."""
     if len(histories) == 1:
         return histories[0]
     return join([dataclasses.replace(history, dissipated=history.dissipated[None]) for history in histories])
@@ -73,10 +72,10 @@ class TangentLaw(NamedTuple):
     """Contact linearised for one Newton step: p = pressure + slope (g - clearance).
 
     Newton's method on displacement and pressure together, with the pressure eliminated. The
-    pressure follows the linearised clearance, so that the curvature of a surface that a point
-    slides along does not throw it off: what makes stiff laws converge in few full steps.
-    A sliding point whose slip reverses sticks for one step: a sliding point has no stiffness
-    along its slip, so that without this it would jump back and forth for ever.
+    pressure follows the linearised clearance, independent of the curvature of the surface along
+    which a point slides: stiff laws then converge in few full steps.
+    A sliding point whose slip reverses sticks for one step: sliding has no stiffness along the
+    slip, and without this rule the iteration cycles.
     """
 
     pressure: Float[Array, "points *faces"]
@@ -86,28 +85,28 @@ class TangentLaw(NamedTuple):
     curvature: Array | float = 1.0
 
     def __call__(self, clearance: Array) -> Array:
-        """Evaluate the pressure [MPa]; a closed point may pull for one step."""
+        """Evaluate the pressure [MPa]; a closed point may have tension for one step."""
         if self.clearance is None:
             return self.pressure + self.slope * (clearance - jax.lax.stop_gradient(clearance))
         return self.pressure + self.slope * (clearance - self.clearance)
 
     def at_its_pressure(self) -> "TangentLaw":
-        """Keep the slope, but give `pressure` itself: for the geometric part of the tangent."""
+        """Return the law with value `pressure` and the same slope: for the geometric part of the tangent."""
         return self._replace(clearance=None)
 
 
 class FacePoints(NamedTuple):
-    """Where the points of faces are, and the rigid surface at their x and y.
+    """Positions of face points, and the rigid surface at their x and y.
 
     Attributes:
         fraction: Load fraction [-].
-        position: Of the points [mm].
+        position: Position of the points [mm].
         tangents: dx/dξ and dx/dη there `(2, 3, points, *faces)` [mm].
-        height: Of the surface [mm].
-        slope: Of the surface along x and y `(2, points, *faces)` [-].
-        bend: Second derivatives of the surface `(2, 2, points, *faces)` [1/mm]; None where only forces are asked for.
-        anchor: x and y [mm] of the surface's material point that each point met at the last increment; None on a rigid
-            surface, which has none.
+        height: Height of the surface [mm].
+        slope: Slope of the surface along x and y `(2, points, *faces)` [-].
+        bend: Second derivatives of the surface `(2, 2, points, *faces)` [1/mm]; None where only forces are computed.
+        anchor: x and y [mm] of the surface's material point in contact at the last increment; None on a rigid surface,
+            which needs none.
     """
 
     fraction: Array
@@ -139,4 +138,4 @@ class PointContact(NamedTuple):
     slid: Float[Array, "2 points *faces"]
     friction: Float[Array, "2 points *faces"]  # conjugate to slip in the surface's (x, y)
     sliding: Array
-    slips: Array  # friction at its limit, or just below after an increment that only settles
+    slips: Array  # friction at its limit, or just below it after an increment of relaxation

@@ -1,7 +1,7 @@
 """The two faces of the layer, window and interface: quadrature, gather, assembly, areas.
 
-Face nodes run x fastest, then y. A rule names where contact is integrated: 2×2 or 3×3 Gauss
-points, or the nodes themselves.
+Face nodes run x fastest, then y. A quadrature rule of contact has 2×2 or 3×3 Gauss points,
+or the nodes.
 """
 
 import itertools
@@ -43,10 +43,10 @@ def quadrature(rule: FaceRule) -> Quadrature:
 
 
 def node_shares(cells: str, elements: tuple[int, int]) -> np.ndarray | None:
-    """Compute what the corners of each face stand for, over a quarter of it: `(4, ny, nx)`.
+    """Compute the nodal weights of the corners of each face, over a quarter of it: `(4, ny, nx)`.
 
-    The nodal forces of a uniform pressure on triangles: linear ones have the diagonal of `kuhn_tetrahedra`;
-    on quadratic ones the middles carry all, the vertices nothing.
+    Nodal forces of a uniform pressure on triangles: linear ones have the diagonal of `kuhn_tetrahedra`; quadratic ones
+    have forces at edge midpoints only.
 
     Args:
         cells: "hex8" (None: all alike), "tet4" or "tet10".
@@ -61,7 +61,7 @@ def node_shares(cells: str, elements: tuple[int, int]) -> np.ndarray | None:
 
 
 def filled_vertices(values: Float[Array, "*c my mx"], cells: str) -> Float[Array, "*c my mx"]:
-    """Put the sum of the neighbours at nodes that stand for no area: the vertices of quadratic triangles."""
+    """Set nodes of zero weight, the vertices of quadratic triangles, to the sum of their neighbours."""
     if cells != "tet10":
         return values
     my, mx = values.shape[-2:]
@@ -72,26 +72,26 @@ def filled_vertices(values: Float[Array, "*c my mx"], cells: str) -> Float[Array
 
 
 def gather_face(values: Float[Array, "c my mx"]) -> Float[Array, "4 c ny nx"]:
-    """Collect the nodal values of every face."""
+    """Gather the nodal values of every face."""
     ny, nx = values.shape[1] - 1, values.shape[2] - 1
     return jnp.stack([values[:, y : y + ny, x : x + nx] for x, y in CORNERS])
 
 
 def assemble_face(values: Float[Array, "4 *c ny nx"]) -> Float[Array, "*c my mx"]:
-    """Add face nodal values into nodes."""
+    """Assemble face nodal values at nodes."""
     pairs = values.reshape(2, 2, *values.shape[1:])
     rows = shifted_sum(pairs[:, 0], pairs[:, 1], axis=-1)
     return shifted_sum(rows[0], rows[1], axis=-2)
 
 
 def to_corners(values: Float[Array, "points *c_faces"], rule: FaceRule) -> Float[Array, "4 *c_faces"]:
-    """Integrate a density per unit of (ξ, η) against the shape functions of each face's corners."""
+    """Integrate a density per unit of (ξ, η) with the shape functions of each face's corners."""
     q = quadrature(rule)
     return contract((q.N * q.weights[:, None]).T, values)
 
 
 def to_nodes(values: Float[Array, "points *c ny nx"], rule: FaceRule) -> Float[Array, "*c my mx"]:
-    """Integrate a density per unit of (ξ, η) against the nodal shape functions."""
+    """Integrate a density per unit of (ξ, η) with the nodal shape functions."""
     return assemble_face(to_corners(values, rule))
 
 
@@ -110,7 +110,7 @@ def area_vector(xi: Float[Array, "3 *points"], eta: Float[Array, "3 *points"]) -
 
 
 def nodal_area_vector(x: Float[Array, "3 my mx"], cells: str = "hex8") -> Float[Array, "3 my mx"]:
-    """Integrate n da against the nodal shape functions [mm²]."""
+    """Integrate n da with the nodal shape functions [mm²]."""
     my, mx = x.shape[1:]
     shares = node_shares(cells, (my - 1, mx - 1))
     rule: FaceRule = "gauss2" if shares is None else "nodes"
@@ -129,5 +129,5 @@ def tributary_area(x: Float[Array, "3 my mx"], cells: str = "hex8") -> Float[Arr
 
 
 def size(v: Float[Array, "3 *points"]) -> Float[Array, "*points"]:
-    """Compute the length of a field of vectors that never vanish."""
+    """Compute the norm of a field of non-zero vectors."""
     return jnp.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)

@@ -1,4 +1,4 @@
-"""What dynamics adds to statics: lumped mass, the stable time increment and bulk viscosity of a layer.
+"""Terms of dynamics: lumped mass, stable time increment and bulk viscosity of a layer.
 
 Used by the explicit solver; forces stay in `internal` and `layer_force`.
 """
@@ -16,7 +16,7 @@ from .kinematics import CellKind, LayerCells, contract
 
 Cells = Float[Array, "nz ny nx"]
 
-# Σ |∇N|² over the nodes of each of a box's six tetrahedra is twice Σ 1/L²: no frequency exceeds it.
+# Σ |∇N|² over the nodes of each of a box's six tetrahedra is twice Σ 1/L²: an upper bound of frequencies.
 _TETRAHEDRA = 2.0
 
 
@@ -49,8 +49,8 @@ def stable_increment(body: LayerBody, u: Float[Array, "3 mz my mx"], density: Ar
     """Estimate the largest stable time increment of every element [s], at its current shape and wave speed.
 
     1/sqrt(Σ_J (c_J/L_J)²): c_J is the fastest wave along the element's axis J at its mean deformation gradient,
-    measured like the length L_J in the unloaded layer, so that both the shortening and the stiffening of a pressed
-    element are in it. For a cube it is 0.577 L/c; one free cube allows 0.596, a mesh of them about 0.85.
+    measured like the length L_J in the unloaded layer. It includes the shortening and the stiffening of a compressed
+    element. For a cube it is 0.577 L/c; one free cube allows 0.596, a mesh of them about 0.85.
 
     Args:
         body: The layer.

@@ -1,6 +1,6 @@
-"""Which point of the interface lies at a place in space: where the layer's motion along the faces is undone.
+"""Inverse of the layer's in-plane motion: the point of the interface at a spatial position.
 
-Fields are known at points of the layer that move sideways; maps, pictures and fits ask at places in space.
+Fields are functions of material points, which move sideways; maps, pictures and fits need them at spatial positions.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-# Most Newton steps. One that leads further away is halved: bilinear motion has another slope beyond every edge.
+# Limit of Newton steps. A step that increases the error is halved: bilinear motion has kinks at cell edges.
 _STEPS = 40
-# The interface counts as folded where it covers less than this part of its area.
+# The interface is folded where its projected area ratio is below this.
 _FOLDED = 1e-3
-# How near the search must come, in elements, for a place to count as found, and how near it tries to come; in roundings
-# of the layer's length where numbers are single.
+# Tolerance of a found position, in elements, and target of the search; in round-off of the layer's length for single
+# precision.
 _FOUND, _CLOSE, _ROUNDINGS = 1e-6, 1e-9, 8.0
 
 Motion = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -29,7 +29,7 @@ class Located(NamedTuple):
 
     Attributes:
         at: Their reference x and y [mm]; on the layer's edge where the place lies beyond it.
-        found: Along x, and along y, whether the point lies at the place.
+        found: Whether the point has the spatial position, along x and along y.
     """
 
     at: Float[Array, "2 *points"]
@@ -39,13 +39,13 @@ class Located(NamedTuple):
 def locate(
     motion: Motion, place: Float[Array, "2 *points"], far: Float[Array, "2"], size: Float[Array, "2"]
 ) -> Located:
-    """Find which points of the interface lie at places in space, with first and second derivatives.
+    """Find the points of the interface at spatial positions, with first and second derivatives.
 
     Args:
-        motion: How interface points move.
-        place: x and y [mm].
-        far: Where the layer, which starts at 0, ends along x and y [mm].
-        size: Of an element along x and y [mm].
+        motion: In-plane displacement of interface points.
+        place: Spatial x and y [mm].
+        far: End of the layer, which starts at 0, along x and y [mm].
+        size: Size of an element along x and y [mm].
     """
     far, size = (v.reshape(2, *[1] * (place.ndim - 1)) for v in (far, size))
     frozen, target, end, cell = jax.lax.stop_gradient((motion, place, far, size))
@@ -57,7 +57,7 @@ def locate(
     def closer(search):
         moved, *slopes = frozen(*search.at)
         off = target - search.at - moved
-        # A place beyond an edge is looked for along the edge.
+        # A position beyond an edge is projected onto the edge.
         on_layer = ((search.at > 0.0) | (off > 0.0)) & ((search.at < end) | (off < 0.0))
         left = jnp.max(jnp.abs(jnp.where(on_layer, off, 0.0)) / cell, axis=0)
         worse = left > search.left
@@ -75,20 +75,20 @@ def locate(
         moved, *slopes = motion(*at)
         return at + _newton(place - at - moved, slopes, found)
 
-    # Newton steps carry the derivatives, one order each; across an edge that the place lies beyond there are none.
+    # Each Newton step adds one order of derivatives; across an edge that the position lies beyond they are zero.
     return Located(jax.lax.fori_loop(0, 2, derived, search.at), found)
 
 
 class _Search(NamedTuple):
-    """Where a search is: where it looks next, and what was left of the way where it looked last.
+    """State of a search.
 
     Attributes:
-        count: Looks so far.
-        at: Where to look next [mm].
-        off: What was left at the last look [mm].
-        base: Point that the step starts from.
-        step: Step to where to look next [mm].
-        left: What was left at `base`, in elements.
+        count: Number of evaluations.
+        at: Next trial point [mm].
+        off: Residual at the last evaluation [mm].
+        base: Base point of the step.
+        step: Step from `base` to the trial point [mm].
+        left: Residual at `base`, in elements.
     """
 
     count: Array
@@ -100,7 +100,7 @@ class _Search(NamedTuple):
 
 
 def _newton(off: Array, slopes: Sequence[Array], counted: Array) -> Array:
-    """Compute the step of Newton's method along the axes that count; the slopes have no derivative."""
+    """Compute the Newton step along the active axes; the slopes have no derivative."""
     off = jnp.where(counted, off, 0.0)
     (a, c), (b, d) = (jax.lax.stop_gradient(jnp.where(counted, slope, 0.0)) for slope in slopes)
     determinant = (1.0 + a) * (1.0 + d) - b * c

@@ -1,13 +1,13 @@
 """Energy, internal force and stiffness of a solid body, over any cells.
 
-The forms differ in what of the deformation their cells measure:
+The forms differ in the strain measure of their cells:
 
-- `full`: everything at each point. Locks when nearly incompressible.
+- `full`: F at each point. Locks when nearly incompressible.
 - `mean_dilatation`: J is the cell's mean (energy of F with the mean J: symmetric, free of volumetric
   locking). Source: Simo, Taylor & Pister, CMAME 51 (1985) 177.
-- `hybrid`: the same with the cell's mean stress as an unknown of its own, up to truly incompressible.
-- `reduced`: one point with the cell's mean F; what that leaves without stiffness is held by a small
-  energy of F's deviation from its mean, which vanishes in uniform strain and does not see rotation.
+- `hybrid`: the same with the cell's mean stress as an independent unknown, up to the incompressible limit.
+- `reduced`: one point with the cell's mean F, and hourglass control by a small energy of F's deviation
+  from its mean, which vanishes in uniform strain and is objective.
 """
 
 import itertools
@@ -115,7 +115,7 @@ class SolidBody(eqx.Module):
         return self.cells.in_parts(prepare, finish, u, *fields, *numbers)
 
     def point_tangent(self, u: Array) -> Float[Array, "3 3 3 3 points *cells"]:
-        """Compute dP/dF times the points' volumes [N mm], of a form that measures at each point."""
+        """Compute dP/dF times the points' volumes [N mm], of a form with F at each point."""
         assert self.form == "full"
         k, weight = self._measured(self.cells, self.cells.displacement_gradient(u))
         return self.full_tangent(k).entries() * weight
@@ -134,7 +134,7 @@ class SolidBody(eqx.Module):
     def fields(self, u: Array, mean_stress: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute F [-], Cauchy stress [MPa] and energy per reference volume [MPa] at the points.
 
-        `reduced` has one point to a cell. The energy leaves out what holds its hourglass modes.
+        `reduced` has one point per cell. The energy excludes hourglass control.
         """
         k = self.kinematics(u)
         P = self.material.first_piola(k, self._mean_stress(self.cells, k, mean_stress))
@@ -150,7 +150,7 @@ class SolidBody(eqx.Module):
         return self.cells.volume if self.form == "reduced" else self.cells.weight
 
     def _measured(self, cells: AbstractCells, H: Array) -> tuple[Kinematics, Array]:
-        """Compute the kinematics that the form measures, and the volume of each of its points."""
+        """Compute the kinematics of the form's strain measure, and the volume of each of its points."""
         if self.form == "reduced":
             return kinematics(cells.mean(H, 2)), cells.volume
         return kinematics(H), cells.weight
@@ -174,7 +174,7 @@ class SolidBody(eqx.Module):
         return self.material.isochoric_energy(k) + volumetric
 
     def full_tangent(self, k: Kinematics) -> ProductSum:
-        """Compute dP/dF [MPa] where all of the deformation is measured at each point."""
+        """Compute dP/dF [MPa] of a form with F at each point."""
         A = self.material.tangent(k, self.material.volumetric_stress(k.volume_change))
         return A + ProductSum(direct=((self.material.bulk * k.J**2, k.G, k.G),))
 
@@ -190,8 +190,8 @@ class SolidBody(eqx.Module):
             A = self.material.tangent(k, self._mean_stress(cells, k, mean_stress))
             return cells.referred(A.scaled(weight)), cells.nodal_vectors(k.J * k.G * weight)
         A = self.full_tangent(k)
-        if self.form == "reduced":  # what holds the hourglass modes does not hold the mean strain
-            A = A + self._held(-self._hourglass_stiffness, k.F)
+        if self.form == "reduced":  # hourglass control does not act on the mean strain
+            A = A + self._uniform_tangent(-self._hourglass_stiffness, k.F)
             return A.scaled(weight), None
         return cells.referred(A.scaled(weight)), None
 
@@ -217,15 +217,15 @@ class SolidBody(eqx.Module):
         deviation = H - self.cells.mean(H, 2)
         return 0.5 * self._hourglass_stiffness * jnp.sum(deviation**2 * self.cells.weight)
 
-    def _held(self, stiffness: Array, like: Array) -> ProductSum:
-        """Build the tangent of a stiffness that holds every entry of F, at points like those of a tensor."""
+    def _uniform_tangent(self, stiffness: Array, like: Array) -> ProductSum:
+        """Build the tangent of a stiffness of every entry of F, at points like those of a tensor."""
         eye = jnp.broadcast_to(identity_like(like), like.shape)
         return ProductSum(legs=((jnp.broadcast_to(stiffness, like.shape[2:]), eye, eye),))
 
     def _reduced_stiffness(self, cells: AbstractCells, A: ProductSum) -> Array:
         nothing = jnp.zeros((3, 3, *cells.weight.shape), cells.weight.dtype)
-        eye, held = identity_like(nothing), self._held(self._hourglass_stiffness, nothing)
-        K = cells.matrices(cells.referred(held.scaled(cells.weight)))
+        eye, control = identity_like(nothing), self._uniform_tangent(self._hourglass_stiffness, nothing)
+        K = cells.matrices(cells.referred(control.scaled(cells.weight)))
         mean = cells.nodal_vectors(eye * (cells.weight / cells.volume))  # mean dN_a/dX_J `(a, J, *cells)`
         own = A.entries()[:, :, :, :, 0]
         for J, L in itertools.product(range(3), repeat=2):

@@ -1,8 +1,8 @@
-"""Cells and their quadrature points: geometry, gradients, forces and matrices of what fills the layer.
+"""Cells and their quadrature points: geometry, gradients, forces and matrices of the layer.
 
-A cell is what one set of shape functions covers: an element, or for tetrahedra the box that six of
-them fill. A cell's map is X = hx (i + ξ), Y = hy (j + η), with columns of nodes that stand upright, so
-its inverse gradient has five entries, all known in closed form.
+A cell is the support of one set of shape functions: an element, or for tetrahedra the box of six of them. A cell's map
+is X = hx (i + ξ), Y = hy (j + η), with upright columns of nodes. Its inverse gradient has five entries, all in closed
+form.
 """
 
 import functools
@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from ..model import BlockMesh, LayerMesh
 from ..model.deformation import ProductSum
 from .hex8 import CORNERS, GAUSS_POINTS, GRADIENTS, assemble, gather
-from .staging import apart, mapped
 from .tet import EDGES, FOUR_POINTS, kuhn_tetrahedra, linear_gradients, quadratic_gradients
+from .unfused import mapped, unfused
 
 
 class CellKind(NamedTuple):
@@ -80,7 +80,7 @@ CELLS = {
 
 
 class AbstractCells(eqx.Module):
-    """What a body is integrated over; the caller multiplies stresses and tangents with `weight`."""
+    """Cells that a body is integrated over; the caller multiplies stresses and tangents with `weight`."""
 
     @property
     def weight(self) -> Float[Array, "points *cells"]:
@@ -96,11 +96,11 @@ class AbstractCells(eqx.Module):
         raise NotImplementedError
 
     def assemble(self, vectors: Float[Array, "a 3 *cells"]) -> Array:
-        """Add the nodal values of the cells into nodes."""
+        """Assemble nodal values of the cells at nodes."""
         raise NotImplementedError
 
     def referred(self, tangent: ProductSum) -> ProductSum:
-        """Turn the axes J and L of tangent[i, J, k, L] into those that `matrices` sums along."""
+        """Transform the axes J and L of tangent[i, J, k, L] to those that `matrices` sums over."""
         raise NotImplementedError
 
     def matrices(self, tangent: ProductSum) -> Float[Array, "a b 3 3 *cells"]:
@@ -167,7 +167,7 @@ class LayerCells(AbstractCells):
         return jnp.mean(self.depth) / self.kind.span
 
     def gather(self, u: Float[Array, "c mz my mx"]) -> Float[Array, "a c nz ny nx"]:
-        """Collect the nodal values of every cell."""
+        """Gather the nodal values of every cell."""
         if self.name == "hex8":
             return gather(u)
         span = self.kind.span
@@ -186,7 +186,7 @@ class LayerCells(AbstractCells):
         span, zero = self.kind.span, jnp.zeros((), vectors.dtype)
 
         def placed(values, node):
-            # Values stand `span` nodes apart, from the node's own place in the first cell on.
+            # Values are `span` nodes apart, from the node's position in the first cell on.
             widths = [(at, span - at, span - 1) for at in node]
             shape = [n * span + 1 for n in values.shape[1:]]
             spread = jax.lax.pad(values, zero, [(0, 0, 0), *widths])
@@ -225,7 +225,7 @@ class LayerCells(AbstractCells):
     def in_parts(self, prepare: Callable, finish: Callable, u: Float[Array, "3 mz my mx"], *fields: Any) -> Any:
         """Evaluate finish(cells, prepare(cells, displacement gradient, fields)) one layer of cells at a time.
 
-        So what it holds stays in the cache; cells lie along one axis, so that loops are long. Results come
+        Intermediate results then fit the cache; cells lie along one axis, so that loops are long. Results have
         layers first.
         """
         nz, ny, nx = self.slope_x.shape[1:]
@@ -242,7 +242,7 @@ class LayerCells(AbstractCells):
             nodal, slope_x, slope_y, *rest = layer
             own = rest.pop() if self.depth.shape[1] > 1 else depth
             cells = LayerCells(self.spacing, own, slope_x, slope_y, self.name)
-            return finish(cells, apart(at_gradient, cells, nodal, *rest))
+            return finish(cells, unfused(at_gradient, cells, nodal, *rest))
 
         results = mapped(one_layer, flat)
         return jax.tree.map(lambda v: v.reshape(*v.shape[:-3], ny, nx), results)
@@ -258,7 +258,7 @@ class LayerCells(AbstractCells):
         return mean
 
     def _gradient(self, nodal: Float[Array, "a 3 nz ny nx"]) -> Float[Array, "3 3 points nz ny nx"]:
-        """Turn the nodal values of the cells into d/dX at the points."""
+        """Compute d/dX at the points from nodal values of the cells."""
         gradient = contract(self.kind.gradients, nodal)
         xi, eta, zeta = gradient[:, 0], gradient[:, 1], gradient[:, 2]
         sx, sy = self.slope_x[:, None], self.slope_y[:, None]
@@ -267,7 +267,7 @@ class LayerCells(AbstractCells):
         return jnp.moveaxis(jnp.stack([d_dx, d_dy, zeta / self.depth[:, None]]), 2, 0)
 
     def _to_reference(self, flux: Array, axis: int = 1) -> Array:
-        """Turn a flux along X `(…, points, nz, ny, nx)`, X at `axis`, into one along ξ: `_gradient` transposed."""
+        """Convert a flux along X `(…, points, nz, ny, nx)`, X at `axis`, into one along ξ: `_gradient` transposed."""
         x, y, z = (jnp.take(flux, k, axis=axis) for k in range(3))
         x, y = x / self.spacing[0], y / self.spacing[1]
         return jnp.stack([x, y, z / self.depth - self.slope_x * x - self.slope_y * y], axis=axis)

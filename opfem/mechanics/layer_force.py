@@ -1,8 +1,8 @@
 """Internal force of a layer of hexahedra by sum-factorised gradients: the inner loop of explicit dynamics.
 
 The same forces as `SolidBody` gives for `full` and `mean_dilatation` and a law in the invariants, several times
-faster: a field is interpolated one axis at a time, Gauss points are leading axes (qz, qy, qx), x is innermost, and
-stress is a closed form of the displacement gradient, so that float32 keeps its digits at small strain.
+faster. A field is interpolated one axis at a time; Gauss points are leading axes (qz, qy, qx), x is innermost. Stress
+is a closed form of the displacement gradient, so that float32 does not lose digits at small strain.
 """
 
 from collections.abc import Callable
@@ -28,8 +28,8 @@ Gradient = list[list[Array]]
 
 _X, _Y, _Z = -1, -2, -3
 _NEAR, _FAR = float(_GAUSS[1]), float(_GAUSS[0])  # weight of the near and of the far end at a Gauss point
-_BLOCK = 8192  # elements that are computed at a time
-_keep = jax.lax.optimization_barrier  # what many kernels read is computed once
+_BLOCK = 8192  # elements per block
+_keep = jax.lax.optimization_barrier  # values that many kernels read are computed once
 
 
 class LayerForce(eqx.Module):
@@ -48,9 +48,9 @@ class LayerForce(eqx.Module):
 
         Args:
             u: Displacement [mm].
-            extra_stress: Mean stress [MPa] that each element has besides the material's, from its mean J - 1 [-] and
-                its own part of the fields.
-            fields: What the stress depends on: trees of numbers and of arrays `(nz, ny, nx)`.
+            extra_stress: Additional mean stress [MPa] of each element, from its mean J - 1 [-] and its part of the
+                fields.
+            fields: Arguments of the stress: trees of numbers and of arrays `(nz, ny, nx)`.
 
         Returns:
             Force [N] at the nodes, and mean J - 1 of every element [-]; it is -1 or less, or NaN, where one inverts.
@@ -77,7 +77,7 @@ class LayerForce(eqx.Module):
 
     def _of_rows(self, u: Nodal, extra_stress: Callable, fields: Any) -> tuple[Nodal, Cells]:
         cells, material = self.body.cells, self.body.material
-        assert isinstance(material, AbstractInvariantMaterial)  # `_is_fast` has seen to it
+        assert isinstance(material, AbstractInvariantMaterial)  # checked by `_is_fast`
         H = self._gradient(u)
         change = _keep(_volume_change(H))
         weight = None if self.uniform else _by_axes(cells.weight)
@@ -127,7 +127,7 @@ class LayerForce(eqx.Module):
 
 
 def _block_rows(elements_in_row: int, ny: int) -> int:
-    """Choose how many rows of elements are computed at a time, so that what they hold stays in the cache."""
+    """Choose the number of rows of elements per block, so that a block fits the cache."""
     divisors = [rows for rows in range(1, ny + 1) if ny % rows == 0]
     fitting = [rows for rows in divisors if rows * elements_in_row <= _BLOCK]
     return max(fitting, default=1) if ny * elements_in_row > 2 * _BLOCK else ny

@@ -1,7 +1,7 @@
-"""Two contact faces evaluated as one: their faces side by side along the last axis, window first.
+"""Two contact faces evaluated together: concatenated along the last axis, window first.
 
-Contact of window and sample differs in law, friction and surface alone. What follows from these, most of the work, is
-traced, compiled and run once for both.
+Contact of window and sample differs in law, friction and surface only. The rest, most of the work, is traced, compiled
+and run once for both.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from ..model.overclosure import AbstractOverclosure
 
 
 class PairedSurface(eqx.Module):
-    """Rigid surfaces, each under its own part of the points."""
+    """Rigid surfaces, each of one part of the points."""
 
     parts: tuple[Any, ...]
 
@@ -32,7 +32,7 @@ class PairedSurface(eqx.Module):
 
 
 class PairedLaw(eqx.Module):
-    """Pressure–overclosure laws, each at its own part of the points."""
+    """Pressure–overclosure laws, each of one part of the points."""
 
     parts: tuple[AbstractOverclosure, ...]
 
@@ -44,13 +44,13 @@ class PairedLaw(eqx.Module):
         """Compute the clearance [mm] of a pressure."""
         return _in_parts([lambda p, part=part: part.clearance_at(p, scale) for part in self.parts], pressure)
 
-    def carried(self, pressure: Array, scale: Array) -> Array:
-        """Compute the clearance [mm] that each law is shifted by."""
-        return _in_parts([lambda p, part=part: part.carried(p, scale) for part in self.parts], pressure)
+    def multiplier_shift(self, pressure: Array, scale: Array) -> Array:
+        """Compute the shift of each law's clearance [mm]."""
+        return _in_parts([lambda p, part=part: part.multiplier_shift(p, scale) for part in self.parts], pressure)
 
 
 class PairedContact(eqx.Module):
-    """Laws and frictions, each at its own part of the points."""
+    """Laws and frictions, each of one part of the points."""
 
     parts: tuple[Contact, ...]
 
@@ -75,7 +75,7 @@ def split(tree: Any, parts: int) -> list[Any]:
 
 
 def join(parts: Sequence[Any]) -> Any:
-    """Put the arrays of several trees side by side along their last axis."""
+    """Concatenate the arrays of several trees along their last axis."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *parts)
 
 

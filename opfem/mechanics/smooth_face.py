@@ -1,7 +1,7 @@
 """A smooth (C¹) surface through the nodes of a deformable face: Catmull–Rom, with its derivatives.
 
-Places are in cells of the face's own grid, and move with it: the material points of the body. On a surface of flat
-facets a point that crosses an edge would see the normal jump, and contact would not converge.
+Places are in cells of the face's grid, and move with it: material points of the body. On flat facets the normal jumps
+at every edge, and contact does not converge.
 
 Source:
     Catmull and Rom, A class of local interpolating splines (1974).
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 # Coefficients of 1, t, t², t³ in the weight of each of the four nodes around a cell, and of its derivative.
 _WEIGHTS = np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]) / 2
 _SLOPES = np.pad(_WEIGHTS[:, 1:] * np.arange(1, 4), np.array([(0, 0), (0, 1)]))
-# How far beyond its rim the surface is continued, in cells: more than half of what a point of a face stands for.
+# Continuation of the surface beyond its rim, in cells: more than half the width of a quadrature point.
 BEYOND = 0.5
 
 Place = Float[Array, "2 *points"]

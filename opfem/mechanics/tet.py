@@ -1,7 +1,7 @@
 """The tetrahedra of a box: six to a hexahedral cell, all sharing its body diagonal.
 
-Each goes from the cell's first corner to its last along three edges, one per axis, in one of the six
-orders of the axes (Kuhn's subdivision). It is the same in every cell, so neighbours conform.
+Kuhn's subdivision: each goes from the cell's first corner to its last along three edges, one per axis, in one of the
+six orders of the axes. It is the same in every cell, so neighbours conform.
 """
 
 import itertools

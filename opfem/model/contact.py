@@ -1,4 +1,4 @@
-"""What holds a face of the layer: bonded, roller, or contact with Coulomb friction."""
+"""Boundary conditions of a face of the layer: bonded, roller, or contact with Coulomb friction."""
 
 from typing import Any
 
@@ -25,8 +25,8 @@ class Roller(eqx.Module):
 class Contact(eqx.Module):
     """Unilateral contact with Coulomb friction.
 
-    Friction sticks with a small elastic slip, then slides at friction × pressure; the slip of
-    every point is remembered from increment to increment.
+    Friction sticks with a small elastic slip, then slides at friction × pressure; the slip history of
+    every point is stored over the increments.
 
     Args:
         law: Pressure–overclosure law.

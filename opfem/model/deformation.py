@@ -76,7 +76,7 @@ class ProductSum(eqx.Module):
         )
 
     def scaled(self, scale: Array) -> "ProductSum":
-        """Multiply with a number per point."""
+        """Multiply by a number per point."""
         kinds = (self.direct, self.crossed, self.legs)
         return ProductSum(*(tuple((scale * factor, P, Q) for factor, P, Q in terms) for terms in kinds))
 
@@ -127,9 +127,9 @@ def transpose(A: Tensor) -> Tensor:
 
 
 def unstacked(A: Tensor) -> Entries:
-    """Take a tensor apart, once: reverse mode puts the entries together again in one go.
+    """Split a tensor into its entries, once: reverse mode then stacks them in one operation.
 
-    Of A[i, j] written often, each would be a whole tensor of zeros to add.
+    Each separate A[i, j] would add a whole tensor of zeros in reverse mode.
     """
     parts = jax.lax.split(A.reshape(9, *A.shape[2:]), [1] * 9)
     return [[part[0] for part in parts[3 * i : 3 * i + 3]] for i in range(3)]

@@ -28,7 +28,7 @@ class AbstractInclusion(eqx.Module):
         return with_units(self, **options)
 
     def contains(self, x: Points, y: Points, depth: Points) -> Bool[Array, "*points"]:
-        """Tell which points [mm] lie inside."""
+        """Return which points [mm] lie inside."""
         raise NotImplementedError
 
 
@@ -57,7 +57,7 @@ class Cylinder(AbstractInclusion):
             raise ValueError(f"Cylinder.depth [mm] must be (from, to) with from < to, got {depth.tolist()}.")
 
     def contains(self, x: Points, y: Points, depth: Points) -> Bool[Array, "*points"]:
-        """Tell which points [mm] lie inside."""
+        """Return which points [mm] lie inside."""
         across = (x - self.centre[0]) ** 2 + (y - self.centre[1]) ** 2 <= self.radius**2
         return across & (depth >= self.depth[0]) & (depth <= self.depth[1])
 
@@ -81,7 +81,7 @@ class Sphere(AbstractInclusion):
         check_positive("Sphere.radius", "mm", self.radius)
 
     def contains(self, x: Points, y: Points, depth: Points) -> Bool[Array, "*points"]:
-        """Tell which points [mm] lie inside."""
+        """Return which points [mm] lie inside."""
         cx, cy, deep = self.centre
         return (x - cx) ** 2 + (y - cy) ** 2 + (depth - deep) ** 2 <= self.radius**2
 
@@ -110,7 +110,7 @@ class Box(AbstractInclusion):
             )
 
     def contains(self, x: Points, y: Points, depth: Points) -> Bool[Array, "*points"]:
-        """Tell which points [mm] lie inside."""
+        """Return which points [mm] lie inside."""
         inside = (x >= self.low[0]) & (x <= self.high[0]) & (y >= self.low[1]) & (y <= self.high[1])
         return inside & (depth >= self.low[2]) & (depth <= self.high[2])
 
@@ -137,7 +137,7 @@ class HalfSpace(AbstractInclusion):
             raise ValueError("HalfSpace.normal [-] must be a direction (x, y, depth), got (0, 0, 0).")
 
     def contains(self, x: Points, y: Points, depth: Points) -> Bool[Array, "*points"]:
-        """Tell which points [mm] lie inside."""
+        """Return which points [mm] lie inside."""
         px, py, deep = self.point
         along_x, along_y, down = self.normal
         return along_x * (x - px) + along_y * (y - py) + down * (depth - deep) >= 0.0

@@ -1,4 +1,4 @@
-"""Loads: what the sample does to the layer at the interface, or the plate of a virtual experiment to both."""
+"""Loads of the sample on the layer at the interface, or of the plate of a virtual experiment on both."""
 
 from typing import Any, Literal
 
@@ -15,13 +15,13 @@ from .surface import INTERPOLATIONS, Interpolation
 class Imprint(eqx.Module):
     """Press the measured loaded surface into the layer as a rigid body (route A).
 
-    The rigid surface moves from L0 to L1 along z, with x and y held, offset by the sample
+    The rigid surface moves from L0 to L1 along z, with x and y fixed, offset by the sample
     law's zero-pressure clearance. The map is sampled at mesh spacing and continued at its
     edge values.
 
     Args:
         thickness: Loaded thickness L1 [mm], masked pixels filled.
-        correct_approach: Also shift out the approach that the pressure itself causes.
+        correct_approach: Compensate the approach that the pressure causes as well.
         interpolation: How the rigid surface runs between its mesh-spaced nodes: "cubic" (C²),
             "catmull-rom" (C¹) or "bilinear" (C⁰; facets, as a meshed rigid body has them).
 
@@ -53,16 +53,16 @@ class Imprint(eqx.Module):
 class Traction(eqx.Module):
     """Apply a load to the interface: force on the layer per reference area, fixed axes.
 
-    A dead load, unless it has a stiffness: then a bed of springs holds every node on its way, and a layer that
-    would snap under the dead load does not.
+    A dead load; with a stiffness, an elastic foundation in addition, which prevents snap-through of a layer that is
+    unstable under the dead load.
 
     Args:
         normal: Pressure-like part [MPa], positive in compression (its force points to -z):
             a number, or interface nodes `(ny+1, nx+1)`.
         lateral: `(2, ny+1, nx+1)` [MPa], x then y. None: Coulomb friction against a sample
             fixed in x and y, bounded by the sample's friction × normal.
-        stiffness: Of the bed [MPa/mm]: at a displacement u_z the normal part is normal + stiffness × u_z. None: a
-            dead load.
+        stiffness: Foundation stiffness [MPa/mm]: at a displacement u_z the normal part is normal + stiffness × u_z.
+            None: a dead load.
 
     Raises:
         ValueError: If a value is not finite, a shape is wrong, or the stiffness is negative.
@@ -119,7 +119,7 @@ class Compression(eqx.Module):
     """Press layer and sample together: the plate of an `Experiment` approaches the window.
 
     Args:
-        approach: How far the plate moves along z [mm], from where the bodies just touch; positive.
+        approach: Travel of the plate along z [mm], from first contact of the bodies; positive.
 
     Raises:
         ValueError: If it is not positive.

@@ -33,8 +33,8 @@ LogStrain = Float[Numbers, "3 *points"]
 class AbstractMaterial(eqx.Module):
     """An isotropic law; `shear` and `bulk` are its moduli at rest [MPa], each a field or a property.
 
-    `calibrated` holds the least and the largest principal stretch [-] of the tests that its numbers come from; solves
-    compare with it what they reached (`stats["beyond_calibration"]`). None: not known.
+    `calibrated` is the least and the largest principal stretch [-] of the tests that its numbers come from; solves
+    compare theirs with it (`stats["beyond_calibration"]`). None: unknown.
     """
 
     bulk: eqx.AbstractVar[Array]
@@ -144,7 +144,7 @@ class AbstractInvariantMaterial(AbstractMaterial):
         B = product(F, transpose(F))
         eye = jnp.broadcast_to(identity_like(F), F.shape)
         one = jnp.ones_like(a)
-        # With half of what is along G ⊗ G, so that this takes no term of its own.
+        # Half of the coefficient along G ⊗ G, which then needs no separate term.
         stretch = 4.0 / 3.0 * (a * F + 2.0 * b * D) - 2.0 / 9.0 * (a * k.I1 + 4.0 * b * k.I2) * G
         tangent = ProductSum(
             direct=((4.0 * b, F, F), (-one, stretch, G), (-one, G, stretch)),
@@ -180,7 +180,7 @@ class MooneyRivlin(AbstractInvariantMaterial):
     Args:
         c10: Coefficient of Ī1 [MPa].
         c01: Coefficient of Ī2 [MPa]; c10 + c01 is positive. One of them may be negative, as fits to silicones have it:
-            the law is then stable up to some stretch, and a solve that goes beyond says so (`RESULTS`).
+            the law is then stable up to some stretch, and a solve beyond it reports so (`RESULTS`).
         bulk: Bulk modulus [MPa], positive. opfem never guesses it: a published deck with D=0
             means bulk = 20 shear in Abaqus/Explicit and incompressible in a hybrid element.
 
@@ -244,7 +244,7 @@ class Yeoh(AbstractInvariantMaterial):
 
     Args:
         c10: Coefficient of Ī1 - 3 [MPa], positive.
-        c20: Coefficient of its square [MPa], often negative: see `MooneyRivlin` on what that does.
+        c20: Coefficient of its square [MPa], often negative: see `MooneyRivlin` on its stability.
         c30: Coefficient of its cube [MPa], of any sign.
         bulk: Bulk modulus [MPa], positive.
 

@@ -18,7 +18,7 @@ _WIDER: dict[type, dict[type, Callable]] = {
         Yeoh: lambda law: Yeoh(law.c10, jnp.zeros_like(law.c10), jnp.zeros_like(law.c10), law.bulk),
     }
 }
-"""How a law of one kind is written as another kind, of which its own is a special case."""
+"""Conversion of a law of one kind to another kind, of which the former is a special case."""
 
 
 def numbers_of(law: AbstractMaterial) -> dict[str, Array]:
@@ -39,12 +39,12 @@ def combined(
     """Build one law that is another one in parts of its points; the last of these wins.
 
     Args:
-        law: Where there is no other.
+        law: Law outside of the parts.
         inclusions: Points of each part, and its law.
         shape: Of the points.
 
     Returns:
-        A law with numbers of this shape; the given one where it has no parts and is the same everywhere.
+        A law with numbers of this shape; the given one without parts and if it is uniform.
 
     Raises:
         ValueError: If the laws are of kinds that none of them includes, or vary and have several terms (`Ogden`).

@@ -19,20 +19,20 @@ from .plausible import check_clearance_unit, check_modulus_unit
 # Overclosure, in units of c0, beyond which the exponential law continues along its tangent;
 # the same threshold as Abaqus (Theory Guide 5.2.1). At p0 = 2 MPa it is 1.3 GPa.
 _LINEAR_BEYOND = 6.0
-# Newton steps from a starting value within a factor of two; they end at rounding.
+# Newton steps from an initial value within a factor of two; they converge to round-off.
 _INVERSE_STEPS = 8
-# Penalty over element stiffness where multipliers carry the pressure, and where nothing does. A layer off whose window
-# two corners lift (50×50×4 elements) takes 11, 13, 13, 15, 15 and 38 increments at 3, 5, 10, 15, 20 and 30, and fails
-# at 1000; the coin on 40×40×4 elements takes 84, 79, 74, 74, 74 and 74 Newton steps. Of 200 random problems 199
+# Penalty over element stiffness, with the method of multipliers and without. Ratios 3, 5, 10, 15, 20 and
+# 30: a layer with two lifted corners (50×50×4 elements) takes 11, 13, 13, 15, 15 and 38 increments, and fails at 1000;
+# the coin on 40×40×4 elements takes 84, 79, 74, 74, 74 and 74 Newton steps. Of 200 random problems 199
 # converge at 3 and 5, and 198 at 10 (`benchmarks/robustness.py`).
 _EXACT_RATIO, _PENALTY_RATIO = 5.0, 1000.0
 
 
 class AbstractOverclosure(eqx.Module):
-    """A law p(g) with its slope; `scale` is the layer's own stiffness per area [MPa/mm].
+    """A law p(g) with its slope; `scale` is the stiffness of the layer per area [MPa/mm].
 
     Attributes:
-        exact: Whether the law only enforces contact without penetration, and its own penetration is to vanish.
+        exact: Whether the law is a penalty whose penetration the method of multipliers removes.
     """
 
     exact: ClassVar[bool] = False
@@ -48,8 +48,8 @@ class AbstractOverclosure(eqx.Module):
         """Compute the clearance [mm] of a pressure: the inverse of `pressure_at`."""
         raise NotImplementedError
 
-    def carried(self, pressure: Array, scale: Array) -> Array:
-        """Compute the clearance [mm] to shift the law by, so that it gives a pressure without any; 0 unless exact."""
+    def multiplier_shift(self, pressure: Array, scale: Array) -> Array:
+        """Compute the shift of the clearance [mm] at which zero penetration has this pressure; 0 unless exact."""
         return self.clearance_at(pressure, scale) if self.exact else jnp.zeros_like(pressure)
 
     @property
@@ -59,34 +59,35 @@ class AbstractOverclosure(eqx.Module):
 
 
 def _overclosure(clearance: Array) -> Array:
-    # Slope 1 at zero clearance: a layer that just touches the window is held by it.
+    # Slope 1 at zero clearance: a layer that just touches the window is supported by it.
     return jnp.where(clearance <= 0.0, -clearance, 0.0)
 
 
 class HardOverclosure(AbstractOverclosure):
     """Hard contact: no pressure when open, no penetration when closed.
 
-    Enforced by a penalty of `stiffness_ratio` times the stiffness of one element of the layer, and by the method of
-    multipliers: each increment carries the pressure of the last one without penetration, and at full load increments
-    follow until little is left to carry. What penetration is left, `stats["max_penetration"]`, is usually below
-    0.01 µm. So the penalty can be moderate: a stiff one, under which the touching part of a face jumps at the smallest
-    load, makes receding contact fail, as where corners of a sample lift off. It moves no solution beyond the path
-    that friction takes. The sample, which may be curved, is met at the nodes of the layer: more conditions than nodes
-    could not all be met.
+    Augmented Lagrangian: a penalty of `stiffness_ratio` times the stiffness of one element of the layer, and the method
+        of multipliers. Each increment has the pressure of the last one as multiplier; at full load, increments repeat
+        until the update is small. The remaining penetration, `stats["max_penetration"]`, is usually below 0.01 µm. The
+        penalty can
+    then be moderate. A stiff one makes receding contact fail, as where corners of a sample lift off. It affects a
+    solution only through the path of friction. Contact with the sample, which may be curved, is integrated at the nodes
+    of the
+    layer: more contact points than nodes would over-constrain it.
 
     `exact=False` is the penalty alone, for a tenth less work. Penetration is then about 1/stiffness_ratio of the
-    element's own shortening under the same pressure: about 0.05 µm at 10 kPa.
+    shortening of an element under the same pressure: about 0.05 µm at 10 kPa.
 
     An element's stiffness is the confined modulus, with at most 20 shear moduli for the bulk modulus, over the
     element's height; and times (height/width)² where it is wider than high: a flat layer bends, and stiffer contact
-    would open and close without end.
+    cycles between open and closed.
 
     Source:
         Nocedal and Wright, Numerical Optimization, chapter 17 (method of multipliers).
 
     Args:
         stiffness_ratio: Penalty stiffness over element stiffness [-]; None is 5, and 1000 where not exact.
-        exact: Whether penetration is to vanish.
+        exact: Whether the method of multipliers removes penetration.
 
     Raises:
         ValueError: If stiffness_ratio is not positive.
@@ -257,6 +258,6 @@ def _along(x: Array, rows: Array, values: Array) -> Array:
         if k < rows.size - 2:
             inside = jnp.where(x < rows[k + 1], inside, rows[k + 1] - rows[k])
         slope = (values[k + 1] - values[k]) / (rows[k + 1] - rows[k])
-        # As everywhere: a point that just touches is held.
+        # As for hard contact: a point that just touches is supported.
         total = total + jnp.where(x >= rows[k], slope * inside, 0.0)
     return total

@@ -27,21 +27,21 @@ class Palpation(eqx.Module):
         extent: (Lx, Ly) [mm]: the layer covers 0..Lx, 0..Ly.
         elements: (nx, ny, nz).
         window: `Contact`, `Bonded` or `Roller` at z = 0.
-        sample: The same at the sample–layer interface.
+        sample: `Contact`, `Bonded` or `Roller` at the sample–layer interface.
         sides: "free", "roller", a dict of these by x0, x1, y0, y1 (missing ones are free), or all four in this
-            order, as they are kept (so that `dataclasses.replace` works).
-        element: How an element measures strain. Hexahedra: "mean_dilatation" (locking-free up to a bulk
+            order, as they are stored (so that `dataclasses.replace` works).
+        element: Strain measure of an element. Hexahedra: "mean_dilatation" (locking-free up to a bulk
             modulus of about 1000 shear moduli), "hybrid" (the same with the mean stress as an unknown: any
             bulk modulus, also `jnp.inf`), "full" (2×2×2 points; locks), "reduced" (one point with hourglass
             control; soft in bending). Tetrahedra that divide the same box: "tet4" (six to an element; locks
             worse than "full") and "tet10" (quadratic, six to 2×2×2 elements with their nodes: nx, ny, nz even).
-            Contact pushes tetrahedra at their nodes with the share of their triangles; in "tet10" only middles
-            of edges have one, and a layer squeezed to 60% between rollers does not converge.
-        side_contact: Whether window and sample push the layer's free sides where they bulge onto them; `Explicit` never
-            does, as in the published decks. Without, `stats["side_overlap"]` says how far sides reach into a body.
-        hold: What keeps a layer in place that friction cannot. None: its mean in-plane motion and
-            rotation at the window are held, until friction can carry what the hold carries. A number
-            [N/mm]: a uniform in-plane spring under the whole layer instead, so that it can drift.
+            Contact acts on tetrahedra at their nodes, weighted by their triangles; in "tet10" only edge midpoints
+            have weight, and a layer squeezed to 60% between rollers does not converge.
+        side_contact: Whether free sides that bulge onto window or sample are in contact with it; never with `Explicit`,
+            as in the published decks. Without, `stats["side_overlap"]` is their overlap with a body.
+        hold: Constraint of rigid in-plane motion that friction does not prevent. None: mean in-plane displacement and
+            rotation at the window are zero until friction can balance the hold force. A number [N/mm]: a uniform
+            in-plane spring under the whole layer instead, so that it can drift.
 
     Raises:
         ValueError: If an argument is out of range or unknown.
@@ -117,10 +117,10 @@ class Palpation(eqx.Module):
 
 
 def named_sides(owner: str, sides: str | Mapping[str, str] | tuple[str, ...]) -> tuple[str, str, str, str]:
-    """Return what holds each side, in the order of `SIDES`.
+    """Return the boundary condition of each side, in the order of `SIDES`.
 
     Args:
-        owner: Whose sides they are, for messages.
+        owner: Name of the owner, for messages.
         sides: As `Palpation` takes them.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Numbers that are in doubt: those that would be plausible in another unit, and a map that does not fit its layer.
+"""Plausibility checks: numbers that suggest another unit, and a map that does not fit its layer.
 
-Looked at where they are known, before anything is compiled. What cannot be meant is refused, what may be is warned of.
+They run on known numbers, before compilation. Impossible values raise an error, unlikely ones a warning.
 """
 
 import warnings
@@ -17,8 +17,8 @@ _MODULI = 1e-6, 1e3
 """Range of moduli and pressures [MPa]: 1 Pa to 1 GPa."""
 _LONGEST_CLEARANCE = 1.0
 """Largest clearance of a contact law [mm]."""
-# Loaded over unloaded thickness that a layer survives, that lift-off reaches, and that no lift-off does; and the share
-# of the map's pixels on the layer that must be beyond.
+# Loaded over unloaded thickness: least of an intact layer, possible with lift-off, impossible; and the share of the
+# map's pixels on the layer that must be beyond.
 _CRUSHED, _LIFTED, _ANOTHER_UNIT = 0.1, 1.2, 5.0
 _RELEVANT = 0.05
 
@@ -79,19 +79,19 @@ def check_unloaded(thickness: Any, field: str = "Layer.thickness") -> None:
 
 
 def check_against_layer(field: str, thickness: ThicknessMap, layer: Any, extent: Any, stacklevel: int) -> None:
-    """Hold a loaded map against the unloaded thickness of its layer, where numbers are known.
+    """Compare a loaded map with the unloaded thickness of its layer, where numbers are known.
 
-    Warns where the sample touches nowhere, or more of the map lies above L0 than a sample lifts off.
+    Warns where the sample has no contact, or more of the map lies above L0 than lift-off explains.
 
     Args:
         field: Name of the loaded map, for messages.
         thickness: The loaded map.
         layer: Unloaded thickness [mm], a number or a map.
         extent: Lx, Ly of the layer [mm].
-        stacklevel: Whose line the warning names: 1 is this function, 2 its caller.
+        stacklevel: Frame that the warning names: 1 is this function, 2 its caller.
 
     Raises:
-        ValueError: If map and layer cannot belong together: in different units, most likely.
+        ValueError: If map and layer are incompatible: most likely in different units.
     """
     pixels = _on_layer(thickness, layer, extent)
     if pixels is None or not pixels[0].size:
@@ -120,7 +120,7 @@ def check_against_layer(field: str, thickness: ThicknessMap, layer: Any, extent:
 
 
 def _on_layer(thickness: ThicknessMap, layer: Any, extent: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Take the loaded thickness [mm] of measured pixels on the layer, and the unloaded one at the nearest sample."""
+    """Return the loaded thickness [mm] of measured pixels on the layer, and the unloaded one at the nearest sample."""
     loaded, reach = _known(thickness), concrete(extent)
     if loaded is None or reach is None:
         return None
@@ -142,7 +142,7 @@ def _on_layer(thickness: ThicknessMap, layer: Any, extent: Any) -> tuple[np.ndar
 
 
 def _known(thickness: ThicknessMap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Take values, mask, x and y of one map whose numbers are known."""
+    """Return values, mask, x and y of one map of known numbers."""
     parts = (thickness.values, thickness.mask, thickness.origin, thickness.extent)
     values, mask, origin, sides = (concrete(part) for part in parts)
     if values is None or mask is None or origin is None or sides is None or values.ndim != 2:

@@ -29,12 +29,12 @@ class Sample(eqx.Module):
     Args:
         thickness: Thickness [mm]: one number, or a `ThicknessMap` for a face towards the layer that is uneven.
         material: Hyperelastic law; its numbers may be arrays `(nz, ny, nx)`, one an element, from the layer's side on.
-        levels: Where the nodes of a column stand, as fractions of its thickness `(nz+1,)` [-], rising from 0 at the
+        levels: Heights of the nodes of a column as fractions of its thickness `(nz+1,)` [-], rising from 0 at the
             layer to 1 at the plate: small steps first make a thick sample cheap. None: equal elements.
-        inclusions: What `with_inclusion` added: (where, material) of each; the last one wins.
+        inclusions: Inclusions of `with_inclusion`: (where, material) of each; the last one wins.
 
     Raises:
-        ValueError: If a number is out of range, or laws cannot stand side by side.
+        ValueError: If a number is out of range, or laws cannot be combined.
     """
 
     thickness: Array | ThicknessMap = eqx.field(metadata={"unit": "mm"})
@@ -85,7 +85,7 @@ class Sample(eqx.Module):
 
         Args:
             where: `Cylinder`, `Sphere`, `Box` or `HalfSpace`; or an array `(nz, ny, nx)`, one an element, from the
-                layer's side on: True inside, or labels, of which 0 stays what it is.
+                layer's side on: True inside, or labels, of which 0 is no inclusion.
             material: Law inside; one for each label 1, 2, … where `where` has several.
 
         Raises:
@@ -121,7 +121,7 @@ class Sample(eqx.Module):
         return self.thickness + 0.0 * x
 
     def fractions(self, elements: int) -> Float[Array, " levels"]:
-        """Return where the nodes of a column stand, as fractions of its thickness [-].
+        """Return the heights of the nodes of a column as fractions of its thickness [-].
 
         Args:
             elements: Number through the thickness.
@@ -139,7 +139,7 @@ class Sample(eqx.Module):
         return self.levels
 
     def inside(self, x: Points, y: Points, depth: Points) -> list[Bool[Array, "*points"]]:
-        """Tell which points lie in each inclusion, whether or not a later one takes them.
+        """Return which points lie in each inclusion, later ones notwithstanding.
 
         Args:
             x: Of the points [mm].

@@ -1,7 +1,7 @@
-"""Where a material law is stable: Drucker's criterion over uniaxial, equibiaxial and planar deformation.
+"""Stable range of a material law: Drucker's criterion over uniaxial, equibiaxial and planar deformation.
 
-A law that takes less stress the more it is deformed has no unique answer. Solves compare the stretches they reached
-with it, after the solve: on the host where numbers are known, inside the program where they are traced.
+A softening law has no unique solution. Solves compare their stretches with the stable range afterwards: on the host for
+known numbers, inside the program for traced ones.
 """
 
 from typing import Any
@@ -18,15 +18,15 @@ from .material import AbstractMaterial
 # Exponents of the stretch in each mode, all at constant volume.
 _EXPONENTS = {"uniaxial": [1.0, -0.5, -0.5], "equibiaxial": [1.0, 1.0, -2.0], "planar": [1.0, 0.0, -1.0]}
 _MODES = np.array(list(_EXPONENTS.values())).T
-# Stretches looked at in each mode, from the smallest reached to the largest, and what their ends may be off.
+# Stretches sampled in each mode, from the smallest reached to the largest, and the tolerance of their ends.
 _SAMPLES = 200
 _ROUNDING = 1e-6
-# Stretches that `stable_stretches` looks at: their spacing is a thousandth.
+# Stretches sampled by `stable_stretches`: their spacing is a thousandth.
 _FINE = 2001
 
 
 def extreme_stretches(k: Kinematics) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Compute the smallest and the largest principal stretch of a field [-], volume change taken out; no derivative.
+    """Compute the smallest and the largest principal stretch of a field [-], without volume change; no derivative.
 
     Eigenvalues of J^(-2/3) C by the trigonometric solution of its characteristic cubic.
 
@@ -39,7 +39,7 @@ def extreme_stretches(k: Kinematics) -> tuple[Float[Array, ""], Float[Array, ""]
     radius = jnp.sqrt(jnp.maximum(mean**2 - I2 / 3.0, jnp.finfo(mean.dtype).tiny ** 0.5))
     angle = jnp.arccos(jnp.clip((2.0 * mean**3 - mean * I2 + 1.0) / (2.0 * radius**3), -1.0, 1.0)) / 3.0
     smallest, largest = (mean + 2.0 * radius * jnp.cos(angle + shift) for shift in (2.0 * np.pi / 3.0, 0.0))
-    # One reduction for both: each would be a program of its own.
+    # One reduction for both: each would be a separate program.
     ends = jnp.max(jnp.stack([-smallest, largest]).reshape(2, -1), axis=1)
     return jnp.sqrt(jnp.maximum(-ends[0], 0.0)), jnp.sqrt(ends[1])
 
@@ -77,12 +77,12 @@ def stable_stretches(material: AbstractMaterial, low: float = 0.3, high: float =
     """Find the stretches around rest over which a law is stable in each mode [-].
 
     Args:
-        material: The law; its numbers are known and the same everywhere.
-        low: Least stretch to look at [-].
-        high: Largest stretch to look at [-].
+        material: The law, of known, uniform numbers.
+        low: Least sampled stretch [-].
+        high: Largest sampled stretch [-].
 
     Returns:
-        Of every mode the least and the largest stretch; those looked at where it is stable throughout.
+        Least and largest stable stretch of every mode; `low` and `high` where it is stable throughout.
     """
     material = jax.tree.map(np.asarray, material)
     log = np.linspace(np.log(low), np.log(high), _FINE)
@@ -97,7 +97,7 @@ def stable_stretches(material: AbstractMaterial, low: float = 0.3, high: float =
 
 
 def _is_stable(material: AbstractMaterial, strain: Any) -> Any:
-    """Tell where every small change at constant volume does positive work on its own stress change."""
+    """Return where dσ : dε > 0 for every small change at constant volume."""
     xp = np if isinstance(strain, np.ndarray) else jnp
     H = xp.asarray(material.log_stiffness(strain))
     # At constant volume the third strain is minus the sum of the others.

@@ -55,7 +55,7 @@ class HeightField(eqx.Module):
         return _total(along_y[:, m, None] * rows[None, :, m] for m in range(4))
 
     def around(self, x: Array, y: Array) -> "Patches":
-        """Collect what the surface is made of around points [mm], to evaluate it there again and again."""
+        """Gather the coefficients of the surface around points [mm], for repeated evaluation."""
         my, mx = self.coefficients.shape
         i, j = _cell(self._in_cells(x, 0), mx), _cell(self._in_cells(y, 1), my)
         basis = jnp.asarray(_CUBICS[self.interpolation], self.coefficients.dtype)
@@ -63,7 +63,7 @@ class HeightField(eqx.Module):
         return Patches(self, powers, i, j)
 
     def _around(self, i: Array, j: Array) -> Float[Array, "4 4 *points"]:
-        """Collect the four by four coefficients that a cell's polynomial is made of."""
+        """Gather the 4 × 4 coefficients of a cell's polynomial."""
         my, mx = self.coefficients.shape
         around = np.arange(-1, 3).reshape(4, *[1] * i.ndim)
         rows, columns = jnp.clip(j + around, 0, my - 1), jnp.clip(i + around, 0, mx - 1)
@@ -89,8 +89,8 @@ class HeightField(eqx.Module):
 class Patches(eqx.Module):
     """The surface around points, each with the polynomial of its grid cell.
 
-    A point that has left its cell is evaluated on the continued polynomial: right to the third order of the way (the
-    second, "catmull-rom"; the first, "bilinear"), so patches serve while points move by a small part of a cell.
+    Outside of its cell a point has the value of the continued polynomial: accurate to third order in the distance
+    (second for "catmull-rom", first for "bilinear"). Patches serve while points move by a small part of a cell.
 
     Attributes:
         field: The surface.
@@ -131,7 +131,7 @@ def height_field(values: Float[Array, "my mx"], origin, spacing, interpolation: 
         values: Heights at the nodes `(my, mx)` [mm].
         origin: Position (x, y) of `values[0, 0]` [mm].
         spacing: Node spacing (dx, dy) [mm].
-        interpolation: How the surface runs between nodes.
+        interpolation: Interpolation between nodes.
     """
     if interpolation == "cubic":
         my, mx = values.shape

@@ -1,6 +1,7 @@
 """What a solution says: labelled data with units, and a short summary for people."""
 
-from ..inverse import Calibration, TractionFit
+from ..calibration import Calibration
+from ..inverse import TractionFit
 from ..solvers import ExperimentSolution, Solution
 from .cautions import residual_rms
 from .compare import Comparison, FieldMetrics, compare

@@ -293,7 +293,7 @@ def _fit(fit: TractionFit) -> dict[str, Variable]:
 
 def _numbers(fit: TractionFit) -> dict[str, Variable]:
     """Fitted numbers of the experiment, in their own units."""
-    if not fit.misfit.parameters:
+    if not fit.objective.parameters:
         return {}
     values, intervals = fit.numbers, fit.number_intervals()
     return {

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
-from ..inverse.observation import interface_heights
+from ..inverse.measured_surface import interface_heights
 from ..measurement import ThicknessMap
 from ..model import Palpation
 from ..solvers import ExperimentSolution, Solution

@@ -1,6 +1,6 @@
-"""How the programs of an untraced solve are compiled: with less effort, and side by side.
+"""Compilation of the programs of an untraced solve: at a low optimisation level, and concurrently.
 
-XLA compiles such a program for longer than it then runs, so that what its optimiser gains is seldom earned back.
+XLA takes longer to compile such a program than to run it; its higher optimisation levels rarely pay.
 """
 
 import functools
@@ -23,13 +23,13 @@ _QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": Fa
 
 @functools.cache
 def compiler_options() -> dict[str, Any]:
-    """Return options for `jax.jit` with which a function that solves compiles sooner, and runs about as fast.
+    """Return options for `jax.jit` that compile a function with a solve faster, at about the same run time.
 
     As in `jax.jit(jax.value_and_grad(mean_pressure), compiler_options=op.compiler_options())`. `solve`, outside of
     `jit`, takes them by itself. JAX refuses options inside of another `jit`.
 
     Returns:
-        Those that this version of XLA knows, for the default device; on other devices than CPUs none.
+        Options that this version of XLA supports on the default device; none on other devices than CPUs.
     """
     known = {}
     for name, value in _QUICK.items() if choices().compiles_slowly else ():
@@ -42,8 +42,8 @@ def compiler_options() -> dict[str, Any]:
 
 
 def is_traced(tree: Any) -> bool:
-    """Tell whether arrays are traced, or whatever is computed from them here would be."""
-    # Whatever is made inside of a trace is traced.
+    """Return whether arrays, or results computed from them here, are traced."""
+    # Inside of a trace new arrays are traced.
     return any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves(tree)))
 
 
@@ -57,11 +57,11 @@ class QuickJit:
 
     @functools.cached_property
     def _jitted(self) -> Any:
-        # It hands options on to `jax.jit`, which its declared overloads leave out.
+        # It passes options to `jax.jit`, which its declared overloads omit.
         return eqx.filter_jit(self._function, compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
 
     def __call__(self, *args: Any) -> Any:
-        """Run it, compiled; as a part of the program where one is traced, whose options are then its own."""
+        """Run the compiled function; inside of a trace, inline it: the options of the outer program apply."""
         return self._inner(*args) if is_traced(args) else self._jitted(*args)
 
     @functools.cached_property
@@ -69,11 +69,11 @@ class QuickJit:
         return eqx.filter_jit(self._function)
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        """Serve as a method."""
+        """Bind to an instance, as a method."""
         return self if instance is None else functools.partial(self, instance)
 
     def compile_for(self, *args: Any) -> None:
-        """Compile for arguments of these shapes, so that a call need not."""
+        """Compile for arguments of these shapes ahead of a call."""
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         shapes = (structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if shapes not in self._known:
@@ -83,9 +83,9 @@ class QuickJit:
 
 @contextmanager
 def compiled_meanwhile(programs: Sequence[tuple[QuickJit, tuple]]) -> Iterator[None]:
-    """Compile programs for arguments in other threads while the body runs; XLA releases Python's lock.
+    """Compile programs in other threads while the body runs; XLA releases Python's lock.
 
-    A program that fails is left to whoever calls it.
+    A failed compilation is repeated, and its error raised, by the first call.
     """
     pool = ThreadPoolExecutor(max_workers=max(1, len(programs)))
     for program, args in programs:

@@ -1,13 +1,11 @@
 """Derivatives of a solve: through its path, one implicit function per solve.
 
-Adaptive loops have no reverse mode. The increments are found without derivatives and recorded; here
-they are gone through again at their recorded displacements, in a scan of fixed length. Each
-displacement is the root of its own balance, so that its derivative costs one linear solve, forward or
-transposed, and friction hands its history on from one to the next.
+Adaptive loops have no reverse mode. The increments are solved without derivatives and recorded. A scan of fixed length
+then differentiates each recorded solve by the implicit function theorem, at one linear solve, forward or transposed.
+The friction history couples one solve to the next.
 
-`follow_path` is for derivatives as users ask for them, of any order. `linearise`, `push` and `pull` are for least
-squares, which multiply with one Jacobian many times: they keep the tangents, solve no more exactly than that needs,
-and share a compiled program among all solves of all paths.
+`follow_path` provides derivatives of any order. `linearise`, `push` and `pull` serve least squares, with many products
+of one Jacobian: they store the tangents, solve to the accuracy that this needs, and share one compiled program.
 """
 
 import dataclasses
@@ -24,26 +22,26 @@ from ..mechanics.boundary import Bodies
 from .compiling import QuickJit
 from .equations import AbstractProblem, State
 from .equilibrium import Forces, Problem
+from .load_path import Recorded
 from .newton import Newton, solve_tangent
 from .stencil import Nodal
-from .stepping import Path
 from .tangent import AbstractTangent, Tangent, Unknowns
 
-# Relative residual of the linear solves, in float64, and the corrections that it may take.
+# Relative residual of the linear solves, in float64, and the limit of corrections.
 _RTOL = 1e-10
 _MOST_CORRECTIONS = 12
-# Relative residual of each correction, in float32: two of them mostly do.
+# Relative residual of each correction, in float32: two of them usually suffice.
 _CORRECTION_RTOL = 1e-5
 # Relative residual of linear solves where the Jacobian is kept, in float32, and the largest that is accepted. At 3e-4,
-# products through a fit's springs, forward and transposed, differ so much that its conjugate gradients may diverge.
+# forward and transposed products through the elastic foundation of a fit differ so much that CGLS may diverge.
 _KEPT_RTOL = 3e-5
 _KEPT_MOST = 1e-2
 
 
 def follow_path(
-    problem: AbstractProblem, start: State, path: Path, length: Array, settings: Newton
+    problem: AbstractProblem, start: State, path: Recorded, length: Array, settings: Newton
 ) -> tuple[State, State]:
-    """Go through recorded solves again, differentiably.
+    """Repeat recorded solves, differentiably.
 
     Returns:
         The last state but one, and the last. Their derivatives are NaN where the path was too long to
@@ -52,30 +50,33 @@ def follow_path(
     settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_CORRECTION_RTOL))
     is_known = length <= path.fraction.shape[0]
 
-    def solved(slowed: AbstractProblem, state: State, solve: Path) -> Unknowns:
+    def solved(slowed: AbstractProblem, state: State, solve: Recorded) -> Unknowns:
         def tangent_solve(matvec, b):
             def solver(transposed):
                 def solved(A, c):
                     tangent = slowed.tangent(solve.x, solve.fraction, state, None, transposed)
                     if transposed:
-                        A = _transposed_product(slowed, solve.x, solve.fraction, state, solve.held)
+                        A = _transposed_product(slowed, solve.x, solve.fraction, state, solve.hold_active)
                     from_left = transposed and slowed.left_transpose
-                    return _solve(slowed, tangent, from_left, solve.held, A, c, is_known, settings)
+                    return _solve(slowed, tangent, from_left, solve.hold_active, A, c, is_known, settings)
 
                 return solved
 
             return jax.lax.custom_linear_solve(matvec, b, solver(False), solver(True))
 
         return jax.lax.custom_root(
-            lambda x: slowed.balance(x, solve.fraction, state, solve.held), solve.x, lambda _, x: x, tangent_solve
+            lambda x: slowed.balance(x, solve.fraction, state, solve.hold_active),
+            solve.x,
+            lambda _, x: x,
+            tangent_solve,
         )
 
-    def one(states, solve: Path):
+    def one(states, solve: Recorded):
         _, state = states
         slowed = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
         x = solved(slowed, state, solve)
         forces = slowed.forces(x, solve.fraction, state)
-        return state, slowed.advance(x, solve.fraction, state, solve.held, forces)
+        return state, slowed.advance(x, solve.fraction, state, solve.hold_active, forces)
 
     def step(states, slot):
         index, solve = slot
@@ -86,14 +87,14 @@ def follow_path(
 
 
 class Handed(NamedTuple):
-    """What one solve of a path hands on to the next, or a change of it."""
+    """State that one solve of a path passes to the next, or its derivative."""
 
     unknowns: Unknowns
     histories: Bodies  # of SlipHistory
 
 
 class Solve(NamedTuple):
-    """One solve of a path: the states before and after, and the viscosity of the medium [-]."""
+    """One solve of a path: the states before and after, and the viscosity [-]."""
 
     before: State
     after: State
@@ -101,7 +102,7 @@ class Solve(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """One solve of a path, and the tangent of its balance."""
+    """One solve of a path, and the tangent of its equilibrium."""
 
     solve: Solve
     tangent: Tangent
@@ -109,22 +110,22 @@ class Slot(NamedTuple):
 
 @QuickJit
 def linearise(problem: Problem, solve: Solve) -> Tangent:
-    """Keep the tangent and the multigrid of one solve, so that a product costs little more than a linear solve."""
+    """Assemble tangent and multigrid of one solve, so that a product costs little more than a linear solve."""
     before, after, viscosity = solve
     slowed = eqx.tree_at(lambda p: p.viscosity, problem, viscosity)
     return slowed.tangent(after.unknowns, after.fraction, before)
 
 
 def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed, settings: Newton) -> Handed:
-    """Multiply with the derivative of the path's end, to 1e-4: one linear solve each slot.
+    """Compute the change of the path's end, to 1e-4, by one linear solve per slot.
 
-    For loads only: one correction does not carry what a change of prescribed displacements does to the rest.
+    For loads only: one correction is not accurate for changes of prescribed displacements.
 
     Args:
         problem: The problem.
         slots: The path.
-        moved: Change of the problem; None for what does not change.
-        first: Change of what the first solve is handed.
+        moved: Change of the problem; None for constant leaves.
+        first: Change of the initial state.
         settings: Settings of the solve.
     """
 
@@ -137,13 +138,13 @@ def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed,
 
 
 def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Nodal, settings: Newton) -> Problem:
-    """Multiply weights of the path's last displacement with the transposed derivative by the problem.
+    """Compute the transposed product: from weights of the last displacement to weights of the problem.
 
     Args:
         problem: The problem.
         slots: The path.
-        varies: Which of the problem's numbers vary.
-        weights: Of the displacement.
+        varies: Mask of the problem's variable numbers.
+        weights: Weights of the displacement.
         settings: Settings of the solve.
     """
 
@@ -164,7 +165,7 @@ def pull(problem: Problem, slots: Sequence[Slot], varies: Problem, weights: Noda
 def programs(
     problem: Problem, solve: Solve, moved: Problem, first: Handed, varies: Problem, settings: Newton
 ) -> list[tuple[QuickJit, tuple]]:
-    """List what `linearise`, `push` and `pull` compile, with arguments of the right shapes, to compile it early."""
+    """List the programs of `linearise`, `push` and `pull`, with arguments of their shapes, to compile them early."""
     tangent = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), eqx.filter_eval_shape(linearise, problem, solve))
     step, yes, varied = solve.after.unknowns, jnp.asarray(True), eqx.filter(problem, varies)
     return [
@@ -178,7 +179,7 @@ def programs(
 
 
 def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: bool = False) -> Any:
-    """Go through slots, each by the one compiled program; where values are traced, by a scan."""
+    """Loop over slots on the host, by one compiled program; by a scan where values are traced."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((carry, slots))) and slots:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *slots)
         return jax.lax.scan(lambda carry, slot: (function(carry, slot), None), carry, stacked, reverse=reverse)[0]
@@ -188,7 +189,7 @@ def _through(function: Callable, carry: Any, slots: Sequence[Slot], reverse: boo
 
 
 class _Equations:
-    """The equations of one solve, as functions of what varies of the problem and of what it was handed."""
+    """The equations of one solve, as functions of the variable numbers of the problem and of the initial state."""
 
     def __init__(self, problem: Problem, solve: Solve, varied: Problem):
         varies = jax.tree.map(lambda leaf: leaf is not None, varied, is_leaf=lambda leaf: leaf is None)
@@ -201,30 +202,32 @@ class _Equations:
         return dataclasses.replace(self.solve.before, u=u, mean_stress=mean_stress, histories=handed.histories)
 
     def balance(self, varied: Problem, handed: Handed) -> Unknowns:
-        """Compute what is out of balance at the state found."""
+        """Compute the residual at the solved state."""
         after = self.solve.after
         problem = eqx.combine(varied, self.problem)
-        return problem.balance(after.unknowns, after.fraction, self._start(handed), after.held)
+        return problem.balance(after.unknowns, after.fraction, self._start(handed), after.hold_active)
 
     def hand_on(self, varied: Problem, handed: Handed, x: Unknowns) -> Handed:
-        """Compute what the next solve is handed."""
+        """Compute the state passed to the next solve."""
         after = self.solve.after
-        # Only the work takes forces, and nothing takes the work.
+        # Forces enter the work only, and nothing depends on the work.
         forces = Forces(jnp.zeros_like(x.u), None, after.applied, None, jnp.ones(()))
-        state = eqx.combine(varied, self.problem).advance(x, after.fraction, self._start(handed), after.held, forces)
+        state = eqx.combine(varied, self.problem).advance(
+            x, after.fraction, self._start(handed), after.hold_active, forces
+        )
         return Handed(x, state.histories)
 
 
 @QuickJit
 def _off_balance(problem: Problem, solve: Solve, moved: Problem, change: Handed) -> Unknowns:
-    """Compute the change of the balance at the state found, less than nothing: what the next step makes up for."""
+    """Compute the negative change of the residual at the solved state: right-hand side of the linear solve."""
     equations = _Equations(problem, solve, moved)
     return jax.tree.map(jnp.negative, jax.jvp(equations.balance, equations.at, (moved, change))[1])
 
 
 @QuickJit
 def _hand_on(problem: Problem, solve: Solve, moved: Problem, change: Handed, step: Unknowns) -> Handed:
-    """Compute the change of what the next solve is handed."""
+    """Compute the change of the state passed to the next solve."""
     equations = _Equations(problem, solve, moved)
     at = (*equations.at, solve.after.unknowns)
     return jax.jvp(equations.hand_on, at, (moved, change, step))[1]
@@ -234,7 +237,7 @@ def _hand_on(problem: Problem, solve: Solve, moved: Problem, change: Handed, ste
 def _pull_hand_on(
     problem: Problem, solve: Solve, so_far: Problem, weights: Handed
 ) -> tuple[tuple[Problem, Handed], Unknowns]:
-    """Multiply with the transpose of `_hand_on`."""
+    """Compute the transposed product of `_hand_on`."""
     equations = _Equations(problem, solve, so_far)
     pulled = jax.vjp(equations.hand_on, *equations.at, solve.after.unknowns)[1](weights)
     of_problem, of_handed, of_step = pulled
@@ -245,7 +248,7 @@ def _pull_hand_on(
 def _pull_off_balance(
     problem: Problem, solve: Solve, so_far: Problem, of_handed: Handed, step: Unknowns
 ) -> tuple[Problem, Handed]:
-    """Multiply with the transpose of `_off_balance`."""
+    """Compute the transposed product of `_off_balance`."""
     equations = _Equations(problem, solve, so_far)
     pulled = jax.vjp(equations.balance, *equations.at)[1](step)
     return jax.tree.map(jnp.subtract, (so_far, of_handed), pulled)
@@ -253,14 +256,14 @@ def _pull_off_balance(
 
 @QuickJit
 def _solve_kept(problem: Problem, slot: Slot, b: Unknowns, transposed: Array, settings: Newton) -> Unknowns:
-    """Solve with a kept tangent or its transpose, by one program; NaN where that fails.
+    """Solve with a stored tangent or its transpose, by one program; NaN where that fails.
 
-    Both are preconditioned from the left, as the transpose must be (`solve_tangent`).
+    Both use left preconditioning, which the transpose requires (`solve_tangent`).
     """
     settings = eqx.tree_at(lambda n: n.krylov_rtol, settings, jnp.asarray(_KEPT_RTOL))
     tangent = slot.tangent
     tangent = jax.tree.map(lambda new, old: jnp.where(transposed, new, old), tangent.transposed(), tangent)
-    x, remaining = _correction(problem, tangent, True, slot.solve.after.held, b, settings)
+    x, remaining = _correction(problem, tangent, True, slot.solve.after.hold_active, b, settings)
     return jax.tree.map(lambda v: jnp.where(remaining <= _KEPT_MOST, v, jnp.nan), x)
 
 
@@ -268,28 +271,28 @@ def _solve(
     problem: AbstractProblem,
     tangent: AbstractTangent,
     from_left: bool,
-    held: Array,
+    hold_active: Array,
     matvec,
     b: Unknowns,
     is_known: Array,
     settings: Newton,
 ) -> Unknowns:
-    """Solve with the tangent of the balance, or its transpose, by corrections in float32; else NaN.
+    """Solve with the tangent of equilibrium, or its transpose, by iterative refinement of float32 solves; else NaN.
 
-    Where preconditioned from the left, the residual is measured as the move that it stands for (`solve_tangent`).
+    With left preconditioning the norm is that of the preconditioned residual, a displacement (`solve_tangent`).
     """
 
     def measure(r: Unknowns) -> tuple[Array, Unknowns | None]:
         if not from_left:
             return problem.size(r), None
-        inside = problem.inside(r, held)
-        move = problem.precondition(tangent, inside.scaled(problem.stress_scale), held)
+        inside = problem.inside(r, hold_active)
+        move = problem.precondition(tangent, inside.scaled(problem.stress_scale), hold_active)
         pushed = problem.size(move.scaled(1.0 / problem.stress_scale))
         return problem.size(
             r._replace(u=jax.tree.map(jnp.subtract, r.u, inside.u))
         ) + problem.typical_stiffness * pushed, move
 
-    # A pass measures what the one before left, and corrects it: so each product appears, and is compiled, once.
+    # Each pass computes the residual of the previous one and corrects it, so that each product is compiled once.
     def correct(carry):
         x, target, _, count = carry
         r = jax.tree.map(jnp.subtract, b, matvec(x))
@@ -297,7 +300,7 @@ def _solve(
         target = jnp.where(count == 0, _RTOL * size, target)
 
         def corrected():
-            change, _ = _correction(problem, tangent, from_left, held, r, settings, move)
+            change, _ = _correction(problem, tangent, from_left, hold_active, r, settings, move)
             return jax.tree.map(jnp.add, x, change)
 
         solved = size <= target
@@ -313,11 +316,10 @@ def _solve(
     return jax.tree.map(lambda v: jnp.where(solved & is_known, v, jnp.nan), x)
 
 
-def _transposed_product(problem: AbstractProblem, x: Unknowns, fraction: Array, state: State, held: Array):
-    """Make the product with the transposed derivative of the balance.
+def _transposed_product(problem: AbstractProblem, x: Unknowns, fraction: Array, state: State, hold_active: Array):
+    """Make the product with the transposed tangent of equilibrium.
 
-    The layer's own force derives from an energy. Its derivative is symmetric, and a product in forward mode takes
-    half as long as one in reverse.
+    The tangent of the internal force is symmetric, so that forward mode computes its product, in half the time.
     """
     frozen = problem.own_forces(x, state).own
 
@@ -325,10 +327,10 @@ def _transposed_product(problem: AbstractProblem, x: Unknowns, fraction: Array, 
         return problem.own_forces(x, state).own
 
     def others(x: Unknowns) -> Unknowns:
-        return problem.balance(x, fraction, state, held, problem.own_forces(x, state).with_own(frozen))
+        return problem.balance(x, fraction, state, hold_active, problem.own_forces(x, state).with_own(frozen))
 
     def multiply(v: Unknowns) -> Unknowns:
-        inside = v._replace(u=problem.admissible(v.u, held))
+        inside = v._replace(u=problem.admissible(v.u, hold_active))
         return jax.tree.map(jnp.add, jax.jvp(own, (x,), (inside,))[1], jax.vjp(others, x)[1](v)[0])
 
     return multiply
@@ -338,16 +340,16 @@ def _correction(
     problem: AbstractProblem,
     tangent: AbstractTangent,
     from_left: bool,
-    held: Array,
+    hold_active: Array,
     r: Unknowns,
     settings: Newton,
     preconditioned: Unknowns | None = None,
 ) -> tuple[Unknowns, Array]:
-    """Solve with the tangent of the balance once, in float32; also return the relative residual it left."""
-    inside = problem.inside(r, held)
-    result = solve_tangent(problem, tangent, inside, held, settings, from_left, preconditioned)
-    change = problem.inside(result.x, held)
-    # Supports and held motion: the balance has a spring to where they are prescribed.
+    """Solve once with the tangent of equilibrium, in float32; also return the remaining relative residual."""
+    inside = problem.inside(r, hold_active)
+    result = solve_tangent(problem, tangent, inside, hold_active, settings, from_left, preconditioned)
+    change = problem.inside(result.x, hold_active)
+    # Prescribed displacements and the active hold: rows of their penalty.
     k = problem.typical_stiffness
     placed = jax.tree.map(lambda change, r, inside: change + (r - inside) / k, change.u, r.u, inside.u)
     return change._replace(u=placed), result.relative_residual

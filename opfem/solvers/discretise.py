@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike
 from .._checks import concrete
 from ..mechanics.boundary import Bodies, is_side, take
 from ..mechanics.contact_body import ImposedPressure, RigidSurface
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import FaceRule, area_vector, gather_face, node_shares, size, surface_tangents, tributary_area
-from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import ELEMENT_FORMS, layer_body
 from ..model import (
     Bonded,
@@ -31,7 +31,8 @@ from ..model import (
 )
 from ..model.plausible import check_against_layer, check_approach
 from .equilibrium import Problem
-from .supports import Supports, drift_modes
+from .in_plane_hold import drift_modes
+from .supports import Supports
 from .tangent import VOLUME_GUARD
 
 
@@ -42,13 +43,14 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         palpation: The experiment.
         load: The load at load fraction 1.
         start: The load at fraction 0; None for the unloaded layer.
-        rule: Where contact is integrated.
+        rule: Quadrature of contact.
     """
     mesh = palpation.mesh()
     material = palpation.layer.material
     X = mesh.positions()
-    # The scale of hard contact: an element's own stiffness, but no more than its shape gives way with. Contact much
-    # stiffer than that (nearly incompressible, or flat and lifted off in part) opens and closes without end.
+    # Penalty of hard contact: uniaxial-strain stiffness of an element, with a bounded bulk modulus and lower for flat
+    # elements. Much stiffer contact (nearly incompressible, or flat and partly lifted off) cycles between open and
+    # closed.
     bulk = jnp.minimum(material.bulk, VOLUME_GUARD * material.shear)
     height = jnp.mean(mesh.thickness) / mesh.layers
     flatness = jnp.minimum(1.0, height / mesh.element_size)
@@ -57,7 +59,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
     nx, ny, nz = mesh.elements
     cells, _ = ELEMENT_FORMS[palpation.element]
     shares = node_shares(cells, (ny, nx))
-    if shares is not None:  # what triangles carry is known at their nodes
+    if shares is not None:  # contact of triangles is integrated at their nodes
         rule = "nodes"
         shares = jnp.asarray(shares.reshape(4, -1), X.dtype)
 
@@ -87,12 +89,12 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         area = tributary_area(X[:, -1], cells)
         first, last = (_traction(end if isinstance(end, Traction) else None, mesh) for end in (start, load))
         dead = (first * area, last * area)
-        bed = _bed(load, start)
-        if load.lateral is None or bed is not None:
+        foundation = _foundation(load, start)
+        if load.lateral is None or foundation is not None:
             at, xi, eta = surface_tangents(take(X, "sample", with_sides=False), "nodes")
             start_normal, end_normal = (gather_face(-end[2:]).reshape(4, -1) for end in (first, last))
-            rest = None if bed is None else at[2]
-            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), rest, bed)
+            rest = None if foundation is None else at[2]
+            pressure = ImposedPressure(start_normal, end_normal, size(area_vector(xi, eta)), rest, foundation)
             contact = _contact(palpation.sample)
             if load.lateral is not None:
                 contact = dataclasses.replace(contact, friction=0.0)
@@ -105,7 +107,7 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
         share = tributary_area(X[:, 0], cells)
         spring = palpation.hold * share / jnp.sum(share)
     body = layer_body(mesh, material, palpation.element)
-    # Multigrid is made for the stencil of hexahedra; theirs stands in for quadratic elements.
+    # Multigrid needs the stencil of hexahedra, which precondition quadratic elements.
     low_order = layer_body(mesh, material, "full") if palpation.element == "tet10" else None
     contacts = Bodies(with_sides(window), with_sides(sample))
     supports = _supports(palpation, load)
@@ -124,14 +126,14 @@ def discretise(palpation: Palpation, load: Load, start: Load | None, rule: FaceR
 
 
 def _contact(side: Side) -> Contact:
-    assert isinstance(side, Contact)  # check_compatible has seen to it
+    assert isinstance(side, Contact)  # checked by check_compatible
     return side
 
 
 def check_compatible(
     palpation: Palpation | Experiment, load: Load | Compression, start: Load | Compression | None
 ) -> None:
-    """Raise ValueError where load and sample contradict each other, or map and layer; warn where these are in doubt."""
+    """Raise ValueError where load and sample, or map and layer, are incompatible; warn where this is likely."""
     if isinstance(palpation, Experiment) or isinstance(load, Compression):
         _check_experiment(palpation, load, start)
         return
@@ -214,8 +216,8 @@ def _traction(load: Traction | None, mesh: LayerMesh) -> Array:
     return jnp.concatenate([lateral, -normal[None]])
 
 
-def _bed(load: Traction, start: Load | None) -> tuple[Array, Array] | None:
-    """Return the stiffness of the bed [MPa/mm] at both ends; None where there is no bed."""
+def _foundation(load: Traction, start: Load | None) -> tuple[Array, Array] | None:
+    """Return the stiffness of the elastic foundation [MPa/mm] at both ends; None without foundation."""
     first = start.stiffness if isinstance(start, Traction) else load.stiffness
     if first is None and load.stiffness is None:
         return None

@@ -1,7 +1,6 @@
-"""The discrete problem: residual, tangent and supports of a palpation under one load.
+"""The discrete problem of one body under one load: residual, tangent and supports.
 
-Everything a Newton step needs, with the load fraction as a number from 0 (start) to 1 (end) and
-the friction history of the last converged increment.
+The load fraction is a number from 0 (start) to 1 (end); the friction history is that of the last converged increment.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,12 +20,13 @@ from ..mechanics.contact_state import (
     TangentLaw,
     separate_histories,
 )
-from ..mechanics.interaction import Touch, can_pair, paired
 from ..mechanics.internal import LayerBody
-from .equations import AbstractProblem, HoldBalance, State
+from ..mechanics.paired_faces import Touch, can_pair, paired
+from .equations import AbstractProblem, State
+from .in_plane_hold import HoldBalance, lateral_size, rigid_part, without_drift, without_rigid_part
 from .multigrid import build_multigrid
 from .stencil import Nodal
-from .supports import Supports, rigid_drift
+from .supports import Supports
 from .tangent import Tangent, Unknowns, couple_volume
 
 
@@ -34,14 +34,14 @@ class Forces(NamedTuple):
     """Nodal forces on the layer [N] at one state, those of each body, and the smallest volume ratio."""
 
     internal: Nodal
-    volume: Array | None  # that the elements miss for their mean stress [mm³], where it is an unknown
+    volume: Array | None  # volume residual of the elements [mm³], where mean stress is an unknown
     applied: Bodies  # of Touching
     spring: Float[Array, "2 my mx"] | None
     smallest_J: Array
 
     @property
     def own(self) -> Unknowns:
-        """Internal forces [N] and missed volume, which derive from an energy."""
+        """Internal forces [N] and volume residual, the derivative of an energy."""
         return Unknowns(self.internal, self.volume)
 
     def with_own(self, own: Unknowns) -> "Forces":
@@ -53,13 +53,13 @@ class Problem(AbstractProblem):
     """One body between rigid surfaces, and its load, discretised."""
 
     body: LayerBody
-    low_order: LayerBody | None  # elements of the same nodes that stand in for the body's in the preconditioner
+    low_order: LayerBody | None  # elements of the same nodes for the preconditioner
     positions: Nodal
     contacts: Bodies  # of ContactFace
     dead: tuple[Array, Array] | None  # nodal force at the interface [N], at fraction 0 and 1
     imposed: tuple[Array, Array] | None  # u_z at the interface [mm], at fraction 0 and 1
     spring: Array | None  # in-plane stiffness under each node of the window face [N/mm]
-    viscosity: Array  # of the medium that slows the layer on its way through a snap [-], else 0
+    viscosity: Array  # viscous regularisation during a snap-through [-], else 0
     drift_modes: Float[Array, "modes 2 my mx"] | None  # see `drift_modes`; None where supports prevent them all
     supports: Supports = eqx.field(static=True)
 
@@ -75,7 +75,7 @@ class Problem(AbstractProblem):
         return self.supports.free(self.positions.shape[1:])
 
     def own_forces(self, x: Unknowns, state: State) -> Forces:
-        """Compute the forces of layer, medium and spring [N], none applied."""
+        """Compute internal, viscous and hold-spring forces [N], without applied ones."""
         u, mean_stress = x
         internal, smallest_J = self.body.internal_force(u, mean_stress)
         volume = None if mean_stress is None else self.body.volume_residual(u, mean_stress)
@@ -98,7 +98,7 @@ class Problem(AbstractProblem):
     def with_contact(
         self, forces: Forces, points: tuple, fraction: Array, state: State, laws: tuple | None = None
     ) -> Forces:
-        """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
+        """Replace the applied forces by those of linearised contact laws; None: of the nonlinear laws."""
         none = Touching(jnp.zeros_like(forces.internal[:, 0]), None)
         applied = Bodies(none, none)
         for touch, at, law in self._each(points, laws):
@@ -112,7 +112,7 @@ class Problem(AbstractProblem):
         return forces._replace(applied=applied)
 
     def _each(self, *of_faces: tuple | None) -> Iterator[tuple]:
-        """Go through `faces` and what belongs to each."""
+        """Iterate over `faces` and the values of each."""
         nothing = (None,) * len(self.faces)
         return zip(self.faces, *(values or nothing for values in of_faces), strict=True)
 
@@ -128,21 +128,21 @@ class Problem(AbstractProblem):
         )
 
     def follow(self, points: tuple, change: Nodal, state: State, laws: tuple) -> tuple[ContactIterate, ...]:
-        """Compute what the next iteration remembers once a part of the step `change` is taken."""
+        """Update the contact iterate after a part of the step `change`."""
         return tuple(
             touch.face.follow(at, self._take(change, touch), touch.history(state.histories), law)
             for touch, at, law in self._each(points, laws)
         )
 
     def missed_gap(self, before: State, after: State) -> Array:
-        """Compute the largest gap or penetration [mm] that an increment left to hard contact."""
+        """Compute the largest gap or penetration [mm] of hard contact after an increment."""
         gaps = self.contacts.map(
             lambda _, face, *histories: face.missed_gap(*histories), before.histories, after.histories
         )
         return jnp.max(jnp.stack([jnp.zeros_like(after.fraction), *jax.tree.leaves(gaps)]))
 
     def initial_iterates(self, state: State) -> tuple[ContactIterate, ...]:
-        """Start the iteration from the contact of a converged state."""
+        """Initialise the contact iterate from a converged state."""
         return tuple(touch.face.initial_iterate(touch.history(state.histories)) for touch in self.faces)
 
     def reactions(self, forces: Forces) -> Forces:
@@ -168,9 +168,9 @@ class Problem(AbstractProblem):
             unbalanced = unbalanced - put(Touching(spring, None), "window", unbalanced.shape)
         return unbalanced
 
-    def residual(self, forces: Forces, held: Array) -> Unknowns:
-        """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
-        return Unknowns(self.project(jnp.asarray(self.free) * self.unbalanced(forces), held), forces.volume)
+    def residual(self, forces: Forces, hold_active: Array) -> Unknowns:
+        """Compute the unbalanced force [N] of the free unknowns, without the part that the hold balances."""
+        return Unknowns(self.project(jnp.asarray(self.free) * self.unbalanced(forces), hold_active), forces.volume)
 
     @property
     def element_depth(self) -> Array:
@@ -185,68 +185,50 @@ class Problem(AbstractProblem):
 
     @property
     def stress_scale(self) -> Array:
-        """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]; times volume, a force."""
+        """Scale of mean stress over displacement in norms [MPa/mm]; times volume, a force."""
         return self.body.shear / self.body.cells.element_depth
 
     def force_scale(self, forces: Forces) -> Array:
-        """Compute the size of the forces [N] that the residual is measured against."""
+        """Compute the force scale of the residual [N]."""
         applied = self.reactions(forces).applied
         contact = jnp.sum(applied.sample.face**2) + jnp.sum(applied.window.face**2)
         hx, hy = self.body.cells.element_spacing
         nodes = self.positions[0, 0].size
-        # Below a thousandth of the shear modulus on the whole field, forces count as none.
+        # Lower bound of the scale: a thousandth of the shear modulus on the whole field.
         floor = 1e-3 * self.body.shear * hx * hy * np.sqrt(nodes)
         return jnp.sqrt(contact + floor**2)
 
-    def _rigid_part(self, face: Float[Array, "2 my mx"]) -> Float[Array, "2 my mx"]:
-        """Compute the part of in-plane nodal values at the window that moves the layer as a whole."""
-        if self.drift_modes is None:
-            return jnp.zeros_like(face)
-        modes = self.drift_modes.astype(face.dtype)
-        return jnp.tensordot(jnp.tensordot(modes, face, 3), modes, 1)
+    def project(self, r: Nodal, hold_active: Array) -> Nodal:
+        """Project the rigid motions of the active hold out of a nodal field."""
+        return without_rigid_part(self.drift_modes, r, hold_active)
 
-    def project(self, r: Nodal, held: Array) -> Nodal:
-        """Take the held rigid motions out of a nodal field."""
-        if self.drift_modes is None:
-            return r
-        face = r[:2, 0] - jnp.where(held, self._rigid_part(r[:2, 0]), 0.0)
-        return jax.lax.dynamic_update_slice(r, face[:, None], (0, 0, 0, 0))
-
-    def without_drift(self, u: Nodal, held: Array) -> Nodal:
-        """Move the body as a whole so that its window face has none of the held rigid motions."""
-        if self.drift_modes is None:
-            return u
-        drift = rigid_drift(self.positions, u[:2, 0], self.drift_modes, self.supports)
-        return jnp.concatenate([u[:2] - jnp.where(held, drift, 0.0), u[2:]])
+    def without_drift(self, u: Nodal, hold_active: Array) -> Nodal:
+        """Translate and rotate the body until its window face has no rigid motion of the active hold."""
+        return without_drift(self.positions, self.drift_modes, self.supports, u, hold_active)
 
     def limited(self, change: Nodal, step_limit: float | int | Array) -> Nodal:
-        """Shorten the moves of single nodes that stand out of a step."""
+        """Limit the outliers of a step: displacements of single nodes."""
         reach = jnp.sqrt(jnp.sum(change**2, axis=0))
         thickness = self.elements[0] * self.element_depth
         longest = step_limit * thickness + 4.0 * jnp.mean(reach)
         return change * jnp.minimum(1.0, longest / jnp.where(reach > 0, reach, 1.0))
 
-    def hold_force(self, forces: Forces, held: Array) -> Float[Array, "2 my mx"]:
+    def hold_force(self, forces: Forces, hold_active: Array) -> Float[Array, "2 my mx"]:
         """Compute the nodal force [N] of the in-plane hold on the layer's window face."""
         if forces.spring is not None:
             return forces.spring
-        return jnp.where(held, self._rigid_part((jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]), 0.0)
+        face = (jnp.asarray(self.free) * self.unbalanced(forces))[:2, 0]
+        return jnp.where(hold_active, rigid_part(self.drift_modes, face), 0.0)
 
     def hold_balances(self, forces: Forces, state: State) -> tuple[HoldBalance]:
-        """Compare what the hold carries with what friction could, and with the normal force."""
+        """Compute the hold force, the friction that could replace it, and the normal force."""
         forces = self.reactions(forces)
-        hold = self.hold_force(forces, state.held)
-        X = self.positions[:2, 0]
-        arm = X - jnp.mean(X, axis=(1, 2), keepdims=True)
-        radius = jnp.mean(jnp.sqrt(jnp.sum(arm**2, axis=0)))
-        lateral = jnp.sum(hold, axis=(1, 2))
-        moment = jnp.sum(arm[0] * hold[1] - arm[1] * hold[0]) / radius
-        carried = jnp.sqrt(jnp.sum(lateral**2)) + jnp.abs(moment)
-        capacity = jnp.zeros((), carried.dtype)
+        force = lateral_size(self.positions, self.hold_force(forces, state.hold_active))
+        capacity = jnp.zeros((), force.dtype)
         for face, touching in zip(self.contacts, forces.applied, strict=True):
             if face is not None:
                 capacity = capacity + face.contact.friction * jnp.abs(touching.total[2])
-        return (HoldBalance(carried, capacity, jnp.abs(forces.applied.sample.total[2])),)
+        return (HoldBalance(force, capacity, jnp.abs(forces.applied.sample.total[2])),)
 
     def tangent(
         self,
@@ -256,7 +238,7 @@ class Problem(AbstractProblem):
         laws: tuple[TangentLaw, ...] | None = None,
         transposed: bool = False,
         points: tuple[FacePoints, ...] | None = None,
-        springs: Mapping[str, Array] = MappingProxyType({}),
+        coupling: Mapping[str, Array] = MappingProxyType({}),
         stress_scale: Array | None = None,
     ) -> Tangent:
         """Assemble the tangent, in float32.
@@ -264,12 +246,13 @@ class Problem(AbstractProblem):
         Args:
             x: Displacement [mm], and mean stress [MPa] where it is an unknown.
             fraction: Load fraction [-].
-            state: Where the increment started.
-            laws: Linearised contact laws; None for the contact's own.
+            state: Initial state of the increment.
+            laws: Linearised contact laws; None: the tangent of the nonlinear ones.
             transposed: Whether to return the transposed tangent.
-            points: `locate(x.u, fraction, state, bends=True)`, where that is known.
-            springs: Matrices of faces for the preconditioner alone [N/mm], by the names of `Bodies`.
-            stress_scale: Of the mean stress, where another body's is to be taken.
+            points: `locate(x.u, fraction, state, bends=True)`, if computed before.
+            coupling: Face matrices of contact with another body, for the preconditioner only [N/mm], by the names of
+                `Bodies`.
+            stress_scale: Scale of mean stress; None: that of this body.
         """
         u, mean_stress = x
         body, low_order = single(self.body), single(self.low_order or self.body)
@@ -283,7 +266,7 @@ class Problem(AbstractProblem):
             )
             K = K + stiffness
         faces = {}
-        for name, matrices in springs.items():
+        for name, matrices in coupling.items():
             K = add_matrices(K, single(matrices), name)
             faces[name] = -single(matrices)
         for touch, at, law in self._each(points or self.locate(u, fraction, state, bends=True), laws):
@@ -314,14 +297,14 @@ class Problem(AbstractProblem):
         )
         return tangent.transposed() if transposed else tangent
 
-    def precondition(self, tangent: Tangent, r: Unknowns, held: Array) -> Unknowns:
-        """Approximate the solution of a tangent system, without the held rigid motions."""
-        # The hold acts on the window face, but what it prevents is motion of the whole body.
+    def precondition(self, tangent: Tangent, r: Unknowns, hold_active: Array) -> Unknowns:
+        """Apply the preconditioner to a tangent system, without the rigid motions of the active hold."""
+        # The hold acts on the window face, but constrains motion of the whole body.
         x = tangent.precondition(r)
-        return x._replace(u=self.without_drift(x.u, held))
+        return x._replace(u=self.without_drift(x.u, hold_active))
 
     def _drag(self, viscosity: Array) -> Array:
-        """Compute the force per move [N/mm] of a node, relative to the last state, in a viscous medium."""
+        """Compute the viscous force per displacement from the last state [N/mm], by node."""
         return viscosity * self.body.shear * self.body.cells.element_depth
 
     def _foundation(self, stiffness: Array) -> Float[Array, "4 4 3 3 faces"]:
@@ -336,15 +319,14 @@ class Problem(AbstractProblem):
         x: Unknowns,
         fraction: Array,
         state: State,
-        held: Array,
+        hold_active: Array,
         forces: Forces,
         points: tuple[FacePoints, ...] | None = None,
     ) -> State:
         """Build the state at the end of an increment, friction history included.
 
-        `points` is `locate(x.u, fraction)`, where that is known.
-
-        The work of an increment is taken as if forces changed linearly along it.
+        `points` is `locate(x.u, fraction)`, if computed before. The work of an increment is integrated by the
+        trapezoidal rule.
         """
         u = x.u
         applied = self.reactions(forces).applied
@@ -365,7 +347,7 @@ class Problem(AbstractProblem):
             mean_stress=x.mean_stress,
             fraction=jnp.asarray(fraction, u.dtype),
             histories=Bodies(**histories),
-            held=held,
+            hold_active=hold_active,
             applied=applied,
             work=state.applied.map(work, applied, state.work),
         )
@@ -398,18 +380,18 @@ _LUMPED = (np.eye(8)[:, :, None, None] / 8.0 * np.eye(3)).astype(np.float32)
 
 
 def _node_share(shape: tuple[int, ...]) -> np.ndarray:
-    """Compute how many elements' worth each node has: 1 inside, half on a face: `_LUMPED` assembled."""
+    """Compute the number of elements per node, `_LUMPED` assembled: 1 inside, half on a face."""
     z, y, x = (np.where(np.isin(np.arange(n), (0, n - 1)), 0.5, 1.0) for n in shape)
     return z[:, None, None] * y[:, None] * x
 
 
 def _window_share(shape: tuple[int, ...]) -> np.ndarray:
-    """Compute how much of the window face each node has along x and y, `(3, *shape)`: of sum 1 in each."""
+    """Compute each node's share of the window face along x and y, `(3, *shape)`, of sum 1 each."""
     share = np.zeros((3, *shape))
     share[:2, 0] = 2.0 * _node_share(shape)[0]
     return share / ((shape[1] - 1) * (shape[2] - 1))
 
 
 def single(tree: Any) -> Any:
-    """Turn every floating-point number into float32."""
+    """Convert every floating-point number to float32."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)

@@ -8,19 +8,20 @@ from jaxtyping import Array
 
 from ..mechanics.boundary import Bodies
 from ..mechanics.contact_body import RigidPlate, RigidSurface
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.contact_pair import SOFT, ContactPair
 from ..mechanics.face import FaceRule
-from ..mechanics.interaction import ContactFace
 from ..mechanics.internal import layer_body, typical
 from ..model import AbstractMaterial, BlockMesh, Bonded, Compression, Contact, Experiment, LayerMesh, Roller, Side
 from .equations import State
 from .equilibrium import Problem
+from .in_plane_hold import drift_modes
 from .stack import Stack
-from .supports import Supports, drift_modes
+from .supports import Supports
 from .tangent import VOLUME_GUARD
 
-# A first guess closes every contact to this share of the lower body's shear modulus: enough for laws that start without
-# stiffness to have some, too little to deform anything.
+# Pressure of every contact at the initial guess, over the lower body's shear modulus: enough for laws of zero initial
+# stiffness to have some, too little to deform the bodies.
 _TOUCH = 1e-3
 
 _KINDS = {Bonded: "bonded", Roller: "roller", Contact: "contact"}
@@ -35,15 +36,15 @@ def discretise_experiment(
     Args:
         experiment: The experiment.
         load: Its compression at load fraction 1.
-        start: That at load fraction 0; None for bodies that just touch.
-        rule: Where contact is integrated.
+        start: Its compression at load fraction 0; None for bodies that just touch.
+        rule: Quadrature of contact.
     """
     layer, sample = single_bodies(experiment, load, start, rule)
     if isinstance(experiment.interface, Bonded):
         return _joined(experiment, layer, sample)
     lower, upper, soft = experiment.layer_mesh(), experiment.sample_mesh(), experiment.layer.material
     exact = experiment.interface.law.exact
-    # The sample's face is curved, and gives way: more conditions than the layer's face has nodes could not all be met.
+    # The sample's face is curved and deformable: more contact points than nodes of the layer's face over-constrain it.
     face = _face(experiment.interface, RigidSurface(None, None), True, lower, soft, "nodes" if exact else rule)
     assert face is not None
     between = 1.0 / (1.0 / face.stiffness + 1.0 / _stiffness(upper, experiment.sample_material()))
@@ -69,20 +70,20 @@ def single_bodies(
     window = _face(experiment.window, RigidSurface(None, None), False, lower, soft, rule)
     pressed = _face(experiment.plate, plate, True, upper, material, rule)
     interface, sides = _KINDS[type(experiment.interface)], experiment.sides
-    held = experiment.hold is not None
-    supports = Supports(_KINDS[type(experiment.window)], interface, sides, held)
+    has_spring = experiment.hold is not None
+    supports = Supports(_KINDS[type(experiment.window)], interface, sides, has_spring)
     layer = _body(experiment, lower, soft, experiment.element[0], supports, Bodies(window, None), None)
     move = None
     if not isinstance(experiment.plate, Contact):
         top = jnp.ones_like(upper.heights[-1])
         move = (-approach * top, -load.approach * top)
-    supports = Supports(interface, _PLATE_KINDS[type(experiment.plate)], sides, held)
+    supports = Supports(interface, _PLATE_KINDS[type(experiment.plate)], sides, has_spring)
     sample = _body(experiment, upper, material, experiment.element[1], supports, Bodies(None, pressed), move)
     return layer, sample
 
 
 def touching(problem: Stack | Problem, state: State, increment: Array) -> State:
-    """Build the state before an undeformed one from which an increment extrapolates to touching bodies."""
+    """Build a fictitious previous state, from which extrapolation brings the bodies into contact."""
     stacked = isinstance(problem, Stack)
     lower = problem.lower if stacked else problem
     faces = (lower.contacts.window, problem.pair.face) if stacked else (lower.contacts.window,)
@@ -98,10 +99,10 @@ def touching(problem: Stack | Problem, state: State, increment: Array) -> State:
 
 
 def _joined(experiment: Experiment, layer: Problem, sample: Problem) -> Problem:
-    """Make one block of a layer and a sample that share nodes."""
+    """Combine a layer and a sample with common nodes into one block."""
     window, plate = layer.contacts.window, sample.contacts.sample
     if window is not None and plate is not None:
-        # They may be evaluated as one, with one scale of hard contact: that of the softer body.
+        # They may be evaluated together, with one scale of hard contact: that of the softer body.
         softer = jnp.minimum(window.stiffness, plate.stiffness)
         window, plate = (dataclasses.replace(face, stiffness=softer) for face in (window, plate))
     supports = Supports(layer.supports.window, sample.supports.interface, experiment.sides, layer.supports.spring)
@@ -152,7 +153,7 @@ def _face(
     material: AbstractMaterial,
     rule: FaceRule,
 ) -> ContactFace | None:
-    """Build the contact of a face, which starts where its law has no pressure yet; None where it is held otherwise."""
+    """Build the contact of a face, which starts at the zero-pressure clearance of its law; None without contact."""
     if not isinstance(side, Contact):
         return None
     return ContactFace(

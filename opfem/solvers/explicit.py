@@ -1,7 +1,7 @@
 """Explicit dynamics: the published method, as a solver for `solve`.
 
-Between two outputs the increments run as one compiled loop; the host loop between them watches the energies, shows
-progress and keeps checkpoints. Inside a trace the same increments run as a scan that can be differentiated.
+Between two outputs the increments run as one compiled loop; the host loop between them checks the energies, shows
+progress and writes checkpoints. Inside a trace the same increments run as a differentiable scan.
 """
 
 import dataclasses
@@ -36,50 +36,51 @@ _COMPILES = "the explicit solver, about 10 s the first time"
 
 
 def _plain(value: Any) -> Any:
-    """Turn a number of NumPy or JAX, which a static field may not hold, into Python's."""
+    """Convert a number of NumPy or JAX, which cannot be a static field, to Python's."""
     return float(value) if isinstance(value, np.generic | jax.Array) and not isinstance(value, Tracer) else value
 
 
 @runtime_checkable
 class Checkpoint(Protocol):
-    """Where a run keeps its state, so that a killed one can go on; `opfem.Checkpoint` is one in a file."""
+    """Storage of a run's state, for its restart; `opfem.Checkpoint` is one in a file."""
 
     def restore(self, inputs: Any, like: Any) -> Any:
-        """Return what was kept for these inputs, or None."""
+        """Return the state stored for these inputs, or None."""
         ...
 
     def keep(self, inputs: Any, state: Any) -> None:
-        """Replace what is kept."""
+        """Replace the stored state."""
         ...
 
 
 class Explicit(eqx.Module):
     """Explicit dynamics: central differences, lumped mass, kinematic contact.
 
-    The method of the published maps. The load is applied over `duration` with a smooth amplitude; the layer is slow
-    enough to be in equilibrium where its kinetic energy is small: `stats` holds all energies at every output.
+    The method of the published maps. The load is applied over `duration` with a smooth amplitude; the layer is
+    quasi-static
+    where its kinetic energy is small: `stats` contains all energies at every output.
 
-    Contact is pure master–slave at the nodes of the two faces; the rigid bodies lead. (The weight 0.5 of the published
-    decks' pairs changes nothing: a rigid body does not give way.) A hard face is met exactly, other laws hold at the
-    end of every increment, by one equation in one unknown per node: neither shortens the increment. Friction sticks
-    without elastic slip. The sides of the layer touch nothing, as in the published decks.
+    Contact is pure master–slave at the nodes of the two faces; the rigid bodies are masters. (The weight 0.5 of the
+    published decks' pairs has no effect against a rigid body.) Hard contact is exact, other laws are satisfied at the
+    end of every increment by one scalar equation per node: neither reduces the stable increment. Friction sticks
+    without elastic slip. The sides of the layer have no contact, as in the published decks.
 
     Args:
         duration: Time over which the load is applied [s].
         mass_scaling: Factor on the density [-], a number or one per element `(nz, ny, nx)`; or "variable": each
-            element as heavy as `increment` needs, at least its own mass.
+            element scaled to the mass that `increment` requires, at least its own.
         density: Density of the layer [t/mm³].
         amplitude: "smooth_step" (fifth-order, at rest at both ends) or "ramp".
         bulk_viscosity: (b1, b2) [-], linear and quadratic.
         damping: Damping proportional to mass [1/s].
-        increment: Time increment [s]; "auto": `safety` times what the elements allow, renewed at every output. Inside
-            jit, grad or vmap it must be a number, because the count of increments must be known.
+        increment: Time increment [s]; "auto": `safety` times the estimated stable one, updated at every output. Inside
+            jit, grad or vmap it must be a number, because the number of increments must be known.
         output_every: Time between outputs [s]; None: a twentieth of the duration.
         safety: Share of the estimated stable increment that "auto" takes [-].
-        energy_limit: Energy missing from the balance, over the largest energy, at which the solve stops [-].
+        energy_limit: Error of the energy balance, over the largest energy, at which the solve stops [-].
         precision: "float32": compute in it, twice as fast, whatever precision the palpation has; None: the palpation's.
-        checkpoint: Where to keep the state at every output, such as `opfem.Checkpoint("run.npz")`; a solve with
-            the same inputs goes on from there. Untraced solves only.
+        checkpoint: Storage of the state at every output, such as `opfem.Checkpoint("run.npz")`; a solve with the same
+            inputs continues from it. Untraced solves only.
 
     Raises:
         ValueError: If a number is out of range, or a name is unknown.
@@ -127,7 +128,7 @@ class Explicit(eqx.Module):
 
     @property
     def is_variable(self) -> bool:
-        """Whether every element is made as heavy as the increment needs."""
+        """Whether the mass of every element is scaled to the increment."""
         return isinstance(self.mass_scaling, str) and self.mass_scaling == "variable"
 
     @property
@@ -167,7 +168,7 @@ def solve_explicit(
     traced = any(isinstance(leaf, Tracer) for leaf in leaves)
     if traced and solver.increment == "auto":
         raise ValueError(
-            'Explicit.increment [s] must be a number inside jit, grad or vmap, got "auto": the count of increments '
+            'Explicit.increment [s] must be a number inside jit, grad or vmap, got "auto": the number of increments '
             'must be known. Solve once outside and take 0.9 * solution.stats["increment"].'
         )
     with Progress(progress and not traced) as bar:
@@ -191,15 +192,15 @@ def prepare(
     first: Motion | None,
     may_need_hold: bool = True,
 ) -> tuple[Dynamics, Motion]:
-    """Build the layer in motion and the state it starts from.
+    """Build the dynamic problem and its initial state.
 
     Args:
         palpation: The experiment.
         load: The load.
-        load_start: The load that it starts from; None: none.
+        load_start: Initial load; None: none.
         solver: Settings.
-        first: The state that it starts from; None: at rest.
-        may_need_hold: False where friction is known to keep the layer in place, which saves work.
+        first: Initial state; None: at rest.
+        may_need_hold: False where friction constrains the layer, which saves work.
     """
     problem = discretise(palpation, load, load_start, "nodes")
     if solver.precision is not None:
@@ -226,7 +227,7 @@ def prepare(
         viscosity=bulk_viscosity(body, tuple(jnp.asarray(b, dtype) for b in solver.bulk_viscosity), density, uniform),
         damping=jnp.asarray(solver.damping, dtype) if is_damped else None,
         duration=jnp.asarray(solver.duration, float),
-        held=jnp.where(friction > 0, 0.0, 1.0).astype(dtype),
+        hold_active=jnp.where(friction > 0, 0.0, 1.0).astype(dtype),
         modes=orthonormal_modes(problem, mass[0]) if may_need_hold else None,
         smooth=solver.amplitude == "smooth_step",
     )
@@ -239,7 +240,7 @@ def prepare(
 
 
 def _may_need_hold(palpation: Palpation) -> bool:
-    """Tell whether friction is zero on both sides, or traced."""
+    """Return whether friction is zero on both sides, or traced."""
     sides = [side for side in (palpation.window, palpation.sample) if isinstance(side, Contact)]
     frictions = [concrete(side.friction) for side in sides]
     return all(friction is None or not np.any(friction > 0) for friction in frictions)
@@ -270,7 +271,7 @@ def _mass_scaling(solver: Explicit, body, X: Array, dtype) -> Array:
 
 
 def _viscous_share(solver: Explicit) -> Array:
-    """Compute the share of the stable increment that linear bulk viscosity leaves."""
+    """Compute the reduction factor of the stable increment by linear bulk viscosity."""
     b1 = jnp.asarray(solver.bulk_viscosity[0])
     return jnp.sqrt(1.0 + b1**2) - b1
 
@@ -288,7 +289,7 @@ _begin_history = eqx.filter_jit(begin_history)
 def _run_on_host(
     dynamics: Dynamics, motion: Motion, solver: Explicit, keeper: tuple[Checkpoint, Any] | None, bar: Progress
 ) -> tuple[Motion, History]:
-    """Run output by output; `keeper` is where the state is kept, and the inputs that it belongs to."""
+    """Run output by output; `keeper` is the storage of the state, and the inputs that identify it."""
     count = solver.outputs
     history, done = _begin_history(dynamics, motion, count), jnp.zeros((), int)
     if keeper is not None:
@@ -311,7 +312,7 @@ def _run_on_host(
 
 
 def _run_traced(dynamics: Dynamics, motion: Motion, solver: Explicit) -> tuple[Motion, History]:
-    """Run a fixed count of increments, about √N of them between the states that a reverse derivative keeps."""
+    """Run a fixed number of increments, about √N of them between the states stored for a reverse derivative."""
     assert not isinstance(solver.increment, str)
     outputs = solver.outputs
     steps = math.ceil(solver.duration / solver.increment / outputs * (1.0 - 1e-9))  # to each output

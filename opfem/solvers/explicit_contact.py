@@ -1,9 +1,8 @@
-"""Kinematic contact of explicit dynamics: what a rigid body does to the nodes of a face within one increment.
+"""Kinematic contact of explicit dynamics between a rigid body and the nodes of a face.
 
-Pure master–slave: the rigid body leads, and the layer's nodes are moved from where they would be without contact to
-where the law holds at the end of the increment. The force is what this takes; no penalty, so that contact does not
-shorten the stable increment. The weight of a balanced pair (0.5 in the published decks) does not matter against a
-rigid body: it cannot be moved, so the pair is pure master–slave whatever its weight.
+Pure master–slave: nodes move from their predicted position without contact to the one that satisfies the law at the end
+of the increment. The contact force follows from this correction; without a penalty, contact does not reduce the stable
+increment. The weight of a balanced pair (0.5 in the published decks) has no effect against a rigid body.
 """
 
 from typing import NamedTuple
@@ -14,21 +13,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..mechanics.contact_body import RigidPatches
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import to_nodes
-from ..mechanics.interaction import ContactFace
 from ..model import HardOverclosure
 
 Face = Float[Array, "my mx"]
 FaceVector = Float[Array, "3 my mx"]
 
-# Newton steps on the pressure equation; it starts at the last increment's clearance and gains a digit squared each.
+# Newton steps of the pressure equation, from the last increment's clearance; convergence is quadratic.
 _PRESSURE_STEPS = 4
-# A node counts as slipping from this share of the largest friction, as in the implicit solver.
+# A node slips from this share of the friction limit on, as in the implicit solver.
 _AT_LIMIT = 0.9
 
 
 class Work(NamedTuple):
-    """Energy [N mm] of one node so far: into contact, into friction, and done by the body's motion."""
+    """Energy [N mm] of one node since the start: contact, friction, and work of the body's motion."""
 
     contact: Face
     friction: Face
@@ -36,15 +35,15 @@ class Work(NamedTuple):
 
 
 class FaceMotion(eqx.Module):
-    """What the contact of one face carries from increment to increment.
+    """State of the contact of one face between increments.
 
     Attributes:
-        clearance: Where the pressure equation starts [mm].
+        clearance: Initial guess of the pressure equation [mm].
         normal: Force of the body on the layer along the surface's normal [N].
         friction: The tangential rest [N].
-        slip: Slip along x and y so far [mm].
+        slip: Slip along x and y since the start [mm].
         slips: 1 where friction is at its limit, or within a tenth of it, else 0.
-        work: Energies of every node so far.
+        work: Energies of every node since the start.
     """
 
     clearance: Face
@@ -61,12 +60,12 @@ class FaceMotion(eqx.Module):
 
 
 class Travel(NamedTuple):
-    """The increment under way.
+    """The current increment.
 
     Attributes:
-        before: Load fraction at the start of the increment before.
-        start: At the start of this one.
-        end: At its end.
+        before: Load fraction at the start of the previous increment.
+        start: Load fraction at the start of this one.
+        end: Load fraction at its end.
         increment: Length of the increment [s].
         share: The time in which its forces act, from the middle of the increment before to its own, over its length.
     """
@@ -79,9 +78,9 @@ class Travel(NamedTuple):
 
 
 def still(face: ContactFace, x: FaceVector) -> FaceMotion:
-    """Start a face that nothing touches yet."""
+    """Initialise a face without contact."""
     zero = jnp.zeros_like(x)
-    # The law is open there, so the first pressure equation starts from where the node would be.
+    # The law is open there, so that the first pressure equation starts at the predicted position.
     clearance = jnp.full_like(x[0], 1.0) * face.own_contact.law.zero_pressure_clearance
     return FaceMotion(clearance, zero, zero, zero[:2], zero[0], Work(*zero))
 
@@ -97,28 +96,28 @@ def touch(
     area: Face,
     travel: Travel,
 ) -> tuple[FaceVector, FaceMotion]:
-    """Move the nodes of a face to where contact holds at the end of the increment.
+    """Move the nodes of a face to where the contact law is satisfied at the end of the increment.
 
     Args:
         face: The contact.
-        motion: What it carries.
+        motion: Its state.
         under: The body's surface around the nodes; None for the plane z = 0.
         trial: Position at the end of the increment without contact [mm].
-        move: Displacement in it without contact [mm].
-        last_move: Displacement in it at the velocity of the increment before [mm].
+        move: Displacement in the increment without contact [mm].
+        last_move: Displacement in the increment at the previous velocity [mm].
         mobility: Displacement per force within the increment [mm/N].
         area: Current area of each node [mm²].
-        travel: How far the body has moved.
+        travel: Travel of the body.
 
     Returns:
-        What contact adds to the displacement, and what is carried on.
+        Correction of the displacement by contact, and the new state.
     """
     side = 1.0 if face.above else -1.0
     zero = jnp.zeros_like(area)
     height, slope_x, slope_y, lift = (zero,) * 4 if under is None else under.at(travel.end, trial[0], trial[1])
     stretch = jnp.sqrt(1.0 + slope_x**2 + slope_y**2)
     normal = jnp.stack([-slope_x, -slope_y, jnp.ones_like(slope_x)]) / stretch
-    if face.imposed is not None:  # a dead load pushes elsewhere; here it bounds friction
+    if face.imposed is not None:  # a dead load is applied elsewhere; here it bounds friction
         clearance, push = motion.clearance, imposed_force(face, travel.end, area.shape)
         added = jnp.zeros_like(move)
     else:
@@ -159,8 +158,8 @@ def imposed_force(face: ContactFace, fraction: Array, shape: tuple[int, ...]) ->
 def _push(face: ContactFace, guess: Face, free: Face, mobility: Face, area: Face) -> tuple[Face, Face]:
     """Solve clearance = free + mobility · area · p(clearance) for the clearance and the normal force [N].
 
-    The right side falls and the left side rises, so there is one root. What is left after the last step is linear in
-    all but the clearance it starts from, so that the derivative is that of the root.
+    The right side decreases and the left side increases, so that there is one root. The last step is linear in
+    everything except its initial clearance, so that its derivative is that of the root.
     """
     law = face.own_contact.law
     if isinstance(law, HardOverclosure):

@@ -1,4 +1,4 @@
-"""From a layer in motion to what users read: the same fields as those of the implicit solver."""
+"""Recovery of results from explicit dynamics: the same fields as those of the implicit solver."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -106,7 +106,7 @@ def _clearance(dynamics: Dynamics, m: Motion, body: str) -> Array:
 
 
 def _residual(dynamics: Dynamics, forces: Forces, hold: Array) -> Array:
-    """Compute the inertial force over the contact force: how far the layer is from rest [-]."""
+    """Compute the inertial force over the contact force, a measure of quasi-static equilibrium [-]."""
     problem = dynamics.problem
     unbalanced = problem.unbalanced(forces) * problem.free
     unbalanced = unbalanced.at[:, 0].add(-hold)

@@ -1,4 +1,4 @@
-"""The energies of an explicit solve at its outputs, and what they say about it."""
+"""Energies of an explicit solve at its outputs, and the checks on them."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .explicit_step import Dynamics, Motion
 from .solution import RESULTS
 
-# Kinetic over all energy that counts as quasi-static, and the share of the load that is left out of it.
+# Limit of kinetic over total energy of a quasi-static solve, and the initial share of the load that it excludes.
 _MOST_KINETIC, _START = 0.01, 0.1
 # Energies below this many roundings of shear modulus times volume are too small to judge a balance by.
 _ROUNDINGS = 100.0
@@ -19,14 +19,14 @@ _LEAST_ENERGY = 1e-7
 
 
 class History(eqx.Module):
-    """What is known at the outputs, from the start on; NaN where a run has not got to.
+    """History at the outputs; NaN at those not reached.
 
     Attributes:
         time: Times [s].
         energies: By name [N mm].
         increment: Time increment before each [s].
         steps: Increments so far.
-        floor: Energy [N mm] that is too small to judge a balance by.
+        floor: Energy [N mm] below which the balance is not checked.
     """
 
     time: Float[Array, " outputs"]
@@ -47,25 +47,25 @@ class History(eqx.Module):
 
     @property
     def _scale(self) -> Array:
-        """The largest energy so far, at every output."""
+        """Largest energy up to every output."""
         parts = [jnp.abs(values) for name, values in self.energies.items() if name != "total"]
         sizes = jnp.max(jnp.stack(parts), axis=0)
         return jnp.maximum(jax.lax.cummax(jnp.where(jnp.isfinite(sizes), sizes, 0.0)), self.floor)
 
     @property
     def drift(self) -> Array:
-        """The largest energy missing from the balance, over the largest energy until then [-]."""
+        """Largest error of the energy balance, over the largest energy until then [-]."""
         total = self.energies["total"]
         return jnp.nanmax(jnp.abs(total - total[0]) / self._scale)
 
     @property
     def kinetic_ratio(self) -> Array:
-        """The largest kinetic energy after the start of the load, over the largest energy until then [-]."""
+        """Largest kinetic energy after the start of the load, over the largest energy until then [-]."""
         late = jnp.arange(self.time.size) > _START * (self.time.size - 1) * (1.0 + 1e-6)
         return jnp.nanmax(jnp.where(late, self.energies["kinetic"] / self._scale, 0.0))
 
     def status(self, most_drift: float) -> RESULTS:
-        """Judge a run, finished or not, so far."""
+        """Return the status of a run by its energies."""
         broken = jnp.any(jnp.isfinite(self.time) & ~jnp.isfinite(self.energies["total"]))
         moving = self.kinetic_ratio > _MOST_KINETIC
         result = RESULTS.where(moving, RESULTS.kinetic_energy_high, RESULTS.successful)
@@ -74,7 +74,7 @@ class History(eqx.Module):
 
 
 def begin_history(dynamics: Dynamics, m: Motion, outputs: int) -> History:
-    """Start with the energies of a state."""
+    """Initialise with the energies of a state."""
     empty = jnp.full(outputs + 1, jnp.nan, float)
     energies = {name: empty.at[0].set(value) for name, value in dynamics.energies(m).items()}
     body = dynamics.force.body

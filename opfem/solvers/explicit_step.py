@@ -1,7 +1,7 @@
 """One increment of explicit dynamics: central differences with velocities half an increment behind.
 
-A pure function of its carry, which holds displacement, velocity and mean J of the elements, and what the two faces
-remember. The host loop and the differentiable scan in `explicit` run the same increment.
+A pure function of its state: displacement, velocity, mean J of the elements, and the contact states of both faces. The
+host loop and the differentiable scan in `explicit` run the same increment.
 """
 
 from typing import Any
@@ -12,15 +12,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..mechanics.contact_body import RigidPatches
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.face import area_vector, assemble_face, gather_face, size, surface_tangents
 from ..mechanics.inertia import BulkViscosity, stable_increment
-from ..mechanics.interaction import ContactFace
 from ..mechanics.layer_force import LayerForce
 from .equilibrium import Problem
 from .explicit_contact import FaceMotion, Travel, still, touch
 from .stencil import Nodal
 
-# Increments that share the sample's surface around the nodes; in them a node moves by a thousandth of a cell.
+# Increments that share the surface patches around the nodes; a node moves by a thousandth of a cell in them.
 _REUSED = 16
 
 
@@ -31,15 +31,15 @@ class Motion(eqx.Module):
         u: Displacement at the time reached [mm].
         v: Velocity half an increment before [mm/s].
         change: Mean J - 1 of the elements one increment before [-].
-        bulk: Viscous mean stress of the elements then [MPa].
+        bulk: Viscous mean stress of the elements one increment before [MPa].
         window: Contact of the window face; None: none.
-        sample: The same at the interface.
+        sample: Contact of the interface; None: none.
         hold: Force of the in-plane hold in each rigid motion [N].
-        viscous: Energy that bulk viscosity has taken from the elements so far [N mm].
-        damped: The same of damping, of the nodes.
-        loaded: Work of dead loads and imposed displacements so far, by node of the interface [N mm].
+        viscous: Energy dissipated by bulk viscosity since the start [N mm].
+        damped: Energy dissipated by damping since the start [N mm].
+        loaded: Work of dead loads and imposed displacements since the start, by node of the interface [N mm].
         time: Since the start of the load [s].
-        last: The increment before [s]; zero at rest, which makes the first half step.
+        last: Previous increment [s]; zero at rest, so that the first is a half step.
     """
 
     u: Nodal
@@ -57,7 +57,7 @@ class Motion(eqx.Module):
 
     @property
     def mean_stress(self) -> None:
-        """No element has its mean stress as an unknown."""
+        """Mean stress is no unknown."""
         return None
 
 
@@ -72,8 +72,8 @@ class Dynamics(eqx.Module):
         viscosity: Bulk viscosity.
         damping: Damping proportional to mass [1/s]; None: none.
         duration: Of the load [s].
-        held: 1 where the in-plane hold carries rigid motion, because nothing has friction; else 0.
-        modes: Rigid in-plane motions of the window face that it holds, orthonormal in 1/mass.
+        hold_active: 1 where the in-plane hold constrains rigid motion, without friction; else 0.
+        modes: Rigid in-plane motions of the window face that it constrains, orthonormal in 1/mass.
         smooth: Whether the load follows a smooth step, or grows evenly.
     """
 
@@ -84,7 +84,7 @@ class Dynamics(eqx.Module):
     viscosity: BulkViscosity
     damping: Array | None
     duration: Array
-    held: Array
+    hold_active: Array
     modes: Float[Array, "modes 2 my mx"] | None
     smooth: bool = eqx.field(static=True)
 
@@ -114,17 +114,17 @@ class Dynamics(eqx.Module):
         return (t**3 * (10.0 + t * (6.0 * t - 15.0)) if self.smooth else t).astype(self.mass.dtype)
 
     def stable_increment(self, u: Nodal) -> Array:
-        """Estimate the largest stable increment [s] of the layer, bulk viscosity left out."""
+        """Estimate the stable increment [s] of the layer, without bulk viscosity."""
         return jnp.min(stable_increment(self.force.body, u, self.density))
 
     def under(self, m: Motion) -> RigidPatches | None:
-        """Collect the sample's surface around the nodes of the interface."""
+        """Gather patches of the sample's surface around the nodes of the interface."""
         face = self.problem.contacts.sample
         x, y, _ = self.problem.positions[:, -1] + m.u[:, -1]
         return None if face is None else face.surface.around(x, y)
 
     def step(self, m: Motion, dt: Array, under: RigidPatches | None) -> Motion:
-        """Take one increment dt [s], with the sample's surface around where the nodes are or were shortly before."""
+        """Advance by one increment dt [s], with surface patches around current or recent positions of the nodes."""
         problem, dtype = self.problem, m.u.dtype
         dt = jnp.asarray(dt, dtype)
         mean = 0.5 * (m.last + dt)  # between the middles of the last and of this increment
@@ -178,7 +178,7 @@ class Dynamics(eqx.Module):
     def energies(self, m: Motion) -> dict[str, Array]:
         """Compute all energies [N mm] in the middle of the last increment, and their balance.
 
-        That is where velocities are known and up to where work has been summed.
+        Velocities are known there, and work is summed up to there.
         """
         works = [face.work for face in (m.window, m.sample) if face is not None]
 
@@ -199,7 +199,7 @@ class Dynamics(eqx.Module):
     def _free(self) -> Array | None:
         free = self.problem.supports.free(self.problem.positions.shape[1:])
         if self.problem.imposed is not None:
-            free[2, -1] = 1.0  # these nodes are moved to where they must be, and how hard is counted
+            free[2, -1] = 1.0  # displacement of these nodes is imposed, and its work is summed
         return None if free.all() else jnp.asarray(free, self.mass.dtype)
 
     def _pulled(self, m: Motion, v: Nodal, mean: Array, dt: Array) -> Nodal:
@@ -210,16 +210,16 @@ class Dynamics(eqx.Module):
         return v.at[:2, 0].set(pulled)
 
     def _held(self, v: Nodal, mean: Array) -> tuple[Nodal, Array]:
-        """Take rigid in-plane motion of the window face out of the velocity; also its force in each motion [N]."""
+        """Project rigid in-plane motion of the window face out of the velocity; also return its force [N]."""
         none = jnp.zeros(3, v.dtype)
         if self.modes is None:
             return v, none
-        along = self.held * jnp.tensordot(self.modes, v[:2, 0], 3)
-        held = v.at[:2, 0].add(-jnp.tensordot(along, self.modes, 1) / self.mass[0])
-        return held, none.at[: len(along)].set(-along / mean)
+        along = self.hold_active * jnp.tensordot(self.modes, v[:2, 0], 3)
+        constrained = v.at[:2, 0].add(-jnp.tensordot(along, self.modes, 1) / self.mass[0])
+        return constrained, none.at[: len(along)].set(-along / mean)
 
     def _touch(self, body: str, m: Motion, under: RigidPatches | None, move: Array, mobility: Array, travel: Travel):
-        """Return the displacement of a face in the increment, and what its contact carries on."""
+        """Return the displacement of a face in the increment, and its new contact state."""
         face: ContactFace = getattr(self.problem.contacts, body)
         level = 0 if body == "window" else -1
         here = self.problem.positions[:, level] + m.u[:, level]
@@ -240,7 +240,7 @@ def nodal_area(x: Float[Array, "3 my mx"], face: ContactFace) -> Float[Array, "m
 
 
 def _widest(tree: Any) -> Any:
-    """Take numbers in the widest precision in use: an energy density is a small difference of large numbers."""
+    """Convert numbers to the widest precision in use: an energy density is a small difference of large numbers."""
     return jax.tree.map(lambda leaf: leaf.astype(float) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
@@ -258,7 +258,7 @@ def orthonormal_modes(problem: Problem, mass: Float[Array, "my mx"]) -> Float[Ar
 
 
 def run(dynamics: Dynamics, m: Motion, dt: Array, steps: Array) -> Motion:
-    """Take a number of equal increments."""
+    """Advance by equal increments."""
 
     def group(k, m):
         return several(dynamics, m, dt, jnp.minimum(_REUSED, steps - k * _REUSED))
@@ -267,6 +267,6 @@ def run(dynamics: Dynamics, m: Motion, dt: Array, steps: Array) -> Motion:
 
 
 def several(dynamics: Dynamics, m: Motion, dt: Array, steps: Array) -> Motion:
-    """Take a few equal increments over the same patches of the sample's surface: to collect them is slow."""
+    """Advance by a few equal increments over the same surface patches: gathering them is slow."""
     under = dynamics.under(m)
     return jax.lax.fori_loop(0, steps, lambda _, m: dynamics.step(m, dt, under), m)

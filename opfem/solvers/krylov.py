@@ -47,7 +47,7 @@ def fgmres(
         b: Right-hand side: a PyTree of arrays.
         rtol: Relative tolerance on the residual norm.
         basis: Directions kept before a restart.
-        max_iterations: Most applications of the preconditioner; checked at restarts.
+        max_iterations: Limit of applications of the preconditioner; checked at restarts.
 
     Source:
         Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 9.6.
@@ -131,7 +131,7 @@ def _back_substitute(R: Array, g: Array) -> Array:
 
 
 def _rotate_back(s: _Basis) -> Array:
-    """Express the residual by the directions: so the operator appears, and is compiled, once."""
+    """Compute the residual from the basis, so that the operator is compiled once."""
 
     def rotate(i, r):
         k = s.j - 1 - i

@@ -1,10 +1,9 @@
 """Multigrid for a thin layer: the preconditioner of the tangent system.
 
-x and y are coarsened, z never: each column is solved exactly inside a Chebyshev smoother, which
-carries the strong coupling through the thickness and the contact stiffness. Coarse operators
-are Galerkin products, stencils like the finest one; everything is float32 inside float64 iterations.
-Interpolation to the finest grid lets heights follow lateral motion along a tilted contact (`_lean`).
-An odd count of elements is padded with an empty one, so any mesh coarsens.
+Semi-coarsening in x and y: a Chebyshev smoother solves each column exactly, with the strong coupling through the
+thickness and the contact stiffness. Coarse operators are Galerkin products, stencils like the finest one; all is
+float32 inside float64 iterations. The prolongation to the finest grid is enriched by rigid sliding modes along a tilted
+contact (`_sliding_rise`). An odd number of elements is padded with an empty one, so that any mesh coarsens.
 """
 
 from functools import partial, reduce
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.hex8 import pad_axis
-from ..mechanics.staging import apart
+from ..mechanics.unfused import unfused
 from .stencil import (
     ElementMatrices,
     Nodal,
@@ -33,13 +32,13 @@ from .stencil import (
     with_unit_diagonal,
 )
 
-# The eigenvalues that the smoother damps. None is larger: an element touches four columns, so that
+# Interval of eigenvalues that the smoother damps. 4 is an upper bound: an element has nodes in four columns, so that
 # xᵀ K x ≤ 4 xᵀ D x for the part D of K within columns (element by element, by the triangle inequality).
 _SMOOTHED = (0.5, 4.0)
-# Steps of the smoother before the coarse correction, and as many after it.
+# Smoothing steps before and after the coarse correction.
 _SMOOTHING_STEPS = 2
-# Steps that heights take to follow lateral motion.
-_LEANING_STEPS = 4
+# Chebyshev steps for the sliding modes.
+_RISE_STEPS = 4
 # The coarsest grid is solved by one dense inverse of at most about this many unknowns. 540 would save the coin on
 # 40×40×4 elements a grid, 700 of 13 800 instructions to compile, and cost 12 % of run time: the inverse, and 4 steps
 # of 78 more.
@@ -75,12 +74,12 @@ class Level(NamedTuple):
 class Multigrid(NamedTuple):
     """The operator of the finest grid, the levels, finest first, and the inverse of the coarsest operator.
 
-    `lean` is how far a node of the finest grid moves along z when its surroundings move by 1 along x, and y;
-    zeros where nothing is coarsened.
+    `sliding_rise` is the energy-minimising u_z of the finest grid for unit translations along x and y; zeros without
+    coarse grids.
     """
 
     finest: Stencil
-    lean: Float[Array, "2 mz my mx"]
+    sliding_rise: Float[Array, "2 mz my mx"]
     levels: tuple[Level, ...]
     coarsest: Float[Array, "n n"]
     coarsest_free: Nodal | None
@@ -90,9 +89,9 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
     """Set up the preconditioner.
 
     Args:
-        K: Element matrices [N/mm], contact included, symmetric positive where it matters.
-        free: Static mask of unknowns that are not held, or None.
-        scale: Typical stiffness [N/mm], for the rows of held unknowns.
+        K: Element matrices [N/mm], contact included, symmetric positive definite on free unknowns.
+        free: Static mask of free unknowns; None: all are free.
+        scale: Typical stiffness [N/mm], for the rows of fixed unknowns.
     """
     S = assemble_stencil(K.astype(jnp.float32))
     scale = scale.astype(jnp.float32)
@@ -100,24 +99,26 @@ def build_multigrid(K: ElementMatrices, free: np.ndarray | None, scale: Array) -
     while True:
         mask = None if free is None else jnp.asarray(free, jnp.float32)
         S = S if free is None else S * jnp.asarray(mask_stencil(free), S.dtype)
-        # A coarse grid may have ghosts.
-        whole = S if free is None and not levels else apart(with_unit_diagonal, S, scale)
+        # A coarse grid may have ghost nodes.
+        whole = S if free is None and not levels else unfused(with_unit_diagonal, S, scale)
         nodes = S.shape[-3:]
         if not levels:
-            finest, lean = whole, jnp.zeros((2, *nodes), S.dtype)
+            finest, sliding_rise = whole, jnp.zeros((2, *nodes), S.dtype)
         if 3 * int(np.prod(nodes)) <= _DENSE_UNKNOWNS or max(nodes[1:]) <= 3:
-            return Multigrid(finest, lean, tuple(levels), _invert(dense_matrix(whole), int(np.prod(nodes[1:]))), mask)
+            return Multigrid(
+                finest, sliding_rise, tuple(levels), _invert(dense_matrix(whole), int(np.prod(nodes[1:]))), mask
+            )
         levels.append(Level(whole, _invert_columns(column_blocks(whole)), mask))
         if len(levels) == 1:
-            lean = _lean(whole) if mask is None else mask[:2] * _lean(whole)
-            S = apart(_leaning, S, lean)
+            sliding_rise = _sliding_rise(whole) if mask is None else mask[:2] * _sliding_rise(whole)
+            S = unfused(_enriched, S, sliding_rise)
         for axis in _coarsened_axes(S.shape):
-            S = apart(partial(coarsen_stencil, axis=axis), S)
+            S = unfused(partial(coarsen_stencil, axis=axis), S)
         free = None if free is None else _coarsen_mask(free)
 
 
 def apply_multigrid(multigrid: Multigrid, r: Nodal) -> Nodal:
-    """Approximate the solution of the tangent system by one V-cycle, in float32."""
+    """Apply one V-cycle, in float32."""
     return _v_cycle(multigrid, 0, r.astype(jnp.float32))
 
 
@@ -128,18 +129,20 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
 
     def correction(r):
         if depth == 0:
-            r = jnp.concatenate([r[:2] + multigrid.lean * r[2], r[2:]])
+            r = jnp.concatenate([r[:2] + multigrid.sliding_rise * r[2], r[2:]])
         coarse = _v_cycle(multigrid, depth + 1, _free(multigrid, depth + 1, _restrict(r)))
         fine = _prolong(coarse, r.shape)
         if depth == 0:
-            fine = jnp.concatenate([fine[:2], fine[2:] + jnp.sum(multigrid.lean * fine[:2], axis=0, keepdims=True)])
+            fine = jnp.concatenate(
+                [fine[:2], fine[2:] + jnp.sum(multigrid.sliding_rise * fine[:2], axis=0, keepdims=True)]
+            )
         return fine if level.free is None else fine * level.free
 
     half, factors = _SMOOTHING_STEPS, _chebyshev(_SMOOTHING_STEPS)
     of_step, of_residual = (jnp.asarray(np.concatenate([f, [0.0], f]), r.dtype) for f in factors)
 
-    # Steps of the smoother, the coarse correction and again steps of the smoother, in one loop, so that its parts are
-    # compiled once. The last residual is not needed: a product that costs less than a second copy of the smoother.
+    # Pre-smoothing, coarse correction and post-smoothing in one loop, so that each part is compiled once. The last
+    # residual is not used, but its product costs less than a second copy of the smoother.
     def move(k, carry):
         x, r, step = carry
         step = jax.lax.cond(
@@ -153,15 +156,15 @@ def _v_cycle(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
     return jax.lax.fori_loop(0, 2 * half + 1, move, (none, r, none))[0]
 
 
-def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
-    """Compute how far nodes move along z, at the least energy, where all of them move by 1 along x, and along y.
+def _sliding_rise(S: Stencil) -> Float[Array, "2 mz my mx"]:
+    """Compute the energy-minimising u_z response to unit translations along x and y; it enriches the prolongation.
 
-    A layer that slides along an uneven sample rises and falls with it. Interpolated motion that does not would
-    press on the stiff contact: coarse grids would take for stiff what is soft.
+    A layer that slides along an uneven sample rises and falls with it. Without these modes, interpolated sliding would
+    compress the stiff contact, and coarse grids would overestimate the stiffness of a soft motion.
     """
     zz = S[:, :, 2:, 2:]
     columns = _invert_columns(column_blocks(zz))
-    of_step, of_residual = (jnp.asarray(factors, S.dtype) for factors in _chebyshev(_LEANING_STEPS))
+    of_step, of_residual = (jnp.asarray(factors, S.dtype) for factors in _chebyshev(_RISE_STEPS))
 
     def settle(push):
         def move(k, carry):
@@ -170,16 +173,18 @@ def _lean(S: Stencil) -> Float[Array, "2 mz my mx"]:
             return z + step, r - apply_stencil(zz, step), step
 
         none = jnp.zeros_like(push)
-        return jax.lax.fori_loop(0, _LEANING_STEPS, move, (none, push, none))[0]
+        return jax.lax.fori_loop(0, _RISE_STEPS, move, (none, push, none))[0]
 
     push = reduce(add, (-S[dz, d, 2, :2] for dz in range(3) for d in range(9)))
     return jax.vmap(settle)(push[:, None])[:, 0]
 
 
-def _leaning(S: Stencil, lean: Float[Array, "2 mz my mx"]) -> Stencil:
-    """Turn the third component into what a node's height exceeds the lean by."""
-    S = jnp.concatenate([S[:, :, :, :2] + neighbours(lean)[:, :, None] * S[:, :, :, 2:], S[:, :, :, 2:]], axis=3)
-    return jnp.concatenate([S[:, :, :2] + lean[:, None] * S[:, :, 2:], S[:, :, 2:]], axis=2)
+def _enriched(S: Stencil, sliding_rise: Float[Array, "2 mz my mx"]) -> Stencil:
+    """Change the basis of the third component to u_z minus the response to sliding."""
+    S = jnp.concatenate(
+        [S[:, :, :, :2] + neighbours(sliding_rise)[:, :, None] * S[:, :, :, 2:], S[:, :, :, 2:]], axis=3
+    )
+    return jnp.concatenate([S[:, :, :2] + sliding_rise[:, None] * S[:, :, 2:], S[:, :, 2:]], axis=2)
 
 
 def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
@@ -188,12 +193,12 @@ def _free(multigrid: Multigrid, depth: int, r: Nodal) -> Nodal:
 
 
 def _solve_columns(inverses: Array, r: PartNodal) -> PartNodal:
-    return apart(_times_columns, inverses, r)
+    return unfused(_times_columns, inverses, r)
 
 
 def _times_columns(inverses: Array, r: PartNodal) -> PartNodal:
     components, layers = r.shape[:2]
-    # Row j of an inverse, which is symmetric, times unknown j: summed over layers for all components at once.
+    # Row j of a symmetric inverse times unknown j, summed over layers for all components at once.
     rows = inverses.reshape(components, layers, components * layers, *r.shape[2:])
     products = [rows[:, z] * r[:, z, None] for z in range(layers)]
     by_component = sum(products[1:], start=products[0])
@@ -203,9 +208,8 @@ def _times_columns(inverses: Array, r: PartNodal) -> PartNodal:
 def _invert_columns(blocks: Array) -> Array:
     """Invert every column's matrix by Gauss–Jordan elimination, vectorised over columns.
 
-    No pivoting: the blocks are symmetric positive definite. Returned transposed-ready: they
-    are symmetric, so row j is also column j. No batched LAPACK: two such calls at once block
-    each other for ever on two cores (jaxlib 0.10.2).
+    No pivoting: the blocks are symmetric positive definite. No batched LAPACK: two concurrent calls deadlock on two
+    cores (jaxlib 0.10.2).
     """
     rows = jnp.arange(blocks.shape[0])
 
@@ -222,7 +226,7 @@ def _invert_columns(blocks: Array) -> Array:
 def _invert(A: Float[Array, "n n"], m: int) -> Float[Array, "n n"]:
     """Invert a symmetric positive matrix by Gauss–Jordan elimination of m unknowns at once; m divides n.
 
-    On two cores LAPACK takes up to five times longer here, its threads waiting for those of XLA.
+    On two cores LAPACK takes up to five times longer here, because its threads wait for those of XLA.
     """
     n = A.shape[0]
 
@@ -240,13 +244,13 @@ def _invert(A: Float[Array, "n n"], m: int) -> Float[Array, "n n"]:
 
 
 def _coarsened_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Name the lateral axes long enough to coarsen; two elements are the fewest."""
+    """Return the lateral axes of more than two elements, which coarsen."""
     return tuple(axis for axis in (-1, -2) if shape[axis] > 3)
 
 
 def _coarsen_mask(free: np.ndarray) -> np.ndarray:
     for axis in _coarsened_axes(free.shape):
-        if free.shape[axis] % 2 == 0:  # odd count of elements: the ghost node is free
+        if free.shape[axis] % 2 == 0:  # odd number of elements: the ghost node is free
             widths = np.zeros((free.ndim, 2), int)
             widths[axis, 1] = 1
             free = np.pad(free, widths, constant_values=1)
@@ -267,7 +271,7 @@ def _prolong(v: Array, shape: tuple[int, ...]) -> Array:
 
 def _restrict(r: Array) -> Array:
     for axis in _coarsened_axes(r.shape):
-        reach = r.shape[axis] // 2 * 2 + 1  # of the coarse nodes, the last perhaps beyond the end
+        reach = r.shape[axis] // 2 * 2 + 1  # of the coarse nodes; the last may be a ghost
         r = pad_axis(r, axis, (1, reach + 1 - r.shape[axis]))
         before, at, after = (jax.lax.slice_in_dim(r, k, k + reach, 2, r.ndim + axis) for k in range(3))
         r = at + 0.5 * (before + after)

@@ -1,8 +1,8 @@
 """Newton's method for one load increment, and its settings.
 
-Displacement and contact pressure are unknowns together, the pressure eliminated point by point
-(`TangentLaw`). Each step assembles the tangent, solves it by preconditioned GMRES, shortens the
-moves of single nodes that stand out, and is taken whole unless an element would invert.
+Displacement and contact pressure are unknowns; the pressure is eliminated point by point (`TangentLaw`). Each step
+assembles the tangent, solves it by preconditioned GMRES, limits displacements of outlying nodes, and is halved only
+where an element would invert.
 """
 
 from typing import Any, NamedTuple
@@ -20,8 +20,8 @@ from .equations import AbstractProblem, State
 from .krylov import KrylovResult, fgmres
 from .tangent import AbstractTangent, Unknowns
 
-# Relative residual below which the tangent takes in curvature and area change. Above, the pressures
-# are far from settled, and these terms, proportional to pressure, would make the tangent indefinite.
+# Relative residual below which the tangent includes curvature and area change. Above, pressures have not converged,
+# and these terms, proportional to pressure, would make the tangent indefinite.
 _SETTLED = 0.3
 # An increment is cut after this many steps in a row that end above; on the coin, those that converge have at most six.
 _MOST_UNSETTLED = 10
@@ -36,8 +36,7 @@ class Newton(eqx.Module):
 
     The load is applied in `increments` equal parts. An increment that does not converge is cut
     and repeated from the last converged state, its friction history restored; increments grow
-    again up to that size. Where the layer snaps and no increment helps, it is taken through a viscous
-    medium (`stepping`).
+    again up to that size. Snap-through is solved with viscous regularisation (`stepping`).
 
     Args:
         rtol: Unbalanced force over contact force [-] at convergence (Euclidean norms). The coin's map is within 2e-6
@@ -45,17 +44,17 @@ class Newton(eqx.Module):
             1e-10 before comparing with finite differences.
         increments: Load increments when none is cut.
         max_steps: Newton steps per increment before it is cut.
-        min_increment: Smallest load increment [-] before the solve gives up.
-        max_increments: Most increments tried, repeated ones included.
+        min_increment: Smallest load increment [-]; the solve fails below it.
+        max_increments: Limit of increments, repeated ones included.
         krylov_rtol: Relative residual of each linear solve [-]. On the coin 3e-2 takes a fifth less time, but fails on
             a layer of which three quarters are lifted off; 1e-1 and 1e-3 take longer.
-        krylov_steps: Most preconditioner applications per linear solve.
+        krylov_steps: Limit of preconditioner applications per linear solve.
         max_backtracks: Halvings of a Newton step that inverts an element, before the increment is cut.
-        step_limit: Furthest move of a node in one Newton step, in mean thicknesses of the layer, beyond four
-            times the mean move: a corner that slips over a ridge must not take its neighbours along.
-        max_path: Most accepted increments that a derivative can follow: under `jax.grad` and the like, a
-            solve keeps as many displacement fields. Beyond, derivatives are NaN.
-        face_rule: Where contact is integrated: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
+        step_limit: Limit of a node's displacement in one Newton step, in mean thicknesses of the layer, where it
+            exceeds four times the mean: a corner that slips over a ridge must not distort its neighbours.
+        max_path: Limit of accepted increments for derivatives: under `jax.grad` and the like, a solve stores as many
+            displacement fields. Beyond, derivatives are NaN.
+        face_rule: Quadrature of contact: "gauss2" (2×2), "gauss3" (3×3) or "nodes". Tetrahedra, and a
             sample of exact hard contact, always at the nodes.
 
     Raises:
@@ -75,7 +74,7 @@ class Newton(eqx.Module):
     face_rule: FaceRule = eqx.field(static=True, default="gauss2")
 
     def as_leaves(self) -> "Newton":
-        """Make every number an array, so that another value compiles nothing anew."""
+        """Convert every number to an array, so that another value needs no compilation."""
         return jax.tree.map(lambda v: jnp.asarray(float(v) if isinstance(v, np.floating) else v), self)
 
     def __check_init__(self):
@@ -106,7 +105,7 @@ class IncrementResult(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration is: `x + length × direction` is looked at next, its length at most 1."""
+    """State of the iteration: the next trial point is `x + length × direction`, with length at most 1."""
 
     x: Unknowns
     direction: Unknowns
@@ -122,41 +121,66 @@ class _Iterate(NamedTuple):
     finished: Array
 
 
-def solve_increment(
-    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, held: Array, settings: Newton
-) -> IncrementResult:
-    """Find equilibrium at a load fraction, from a converged state and a first guess.
+class _Increment(NamedTuple):
+    """The equations of one load increment: what Newton's method iterates on."""
 
-    One pass of the loop takes the step that the pass before found, and finds the next: in this order the residual
-    appears, and is compiled, once.
-    """
+    problem: AbstractProblem
+    state: State
+    fraction: Array
+    hold_active: Array
+    settings: Newton
 
-    def evaluate(x):
-        points = problem.locate(x.u, fraction, state, bends=True)
-        forces = problem.with_contact(problem.own_forces(x, state), points, fraction, state)
-        size = problem.size(problem.residual(forces, held))
+    def evaluate(self, x: Unknowns) -> tuple[tuple[Any, tuple], Array, Array]:
+        """Compute forces and contact points at x; the residual's size, infinite where an element inverts; tolerance."""
+        problem = self.problem
+        points = problem.locate(x.u, self.fraction, self.state, bends=True)
+        forces = problem.with_contact(problem.own_forces(x, self.state), points, self.fraction, self.state)
+        size = problem.size(problem.residual(forces, self.hold_active))
         size = jnp.where((forces.smallest_J > 0) & jnp.isfinite(size), size, jnp.inf)
-        return (forces, points), size, settings.rtol * problem.force_scale(forces)
+        return (forces, points), size, self.settings.rtol * problem.force_scale(forces)
 
-    def is_settled(size, tolerance):
-        return size < _SETTLED / settings.rtol * tolerance
+    def is_settled(self, size: Array, tolerance: Array) -> Array:
+        """Return whether pressures have converged far enough for curvature in the tangent."""
+        return size < _SETTLED / self.settings.rtol * tolerance
 
-    def take_step(it):
+    def begin(self, guess: Unknowns) -> _Iterate:
+        """Initialise the iteration, without an evaluation."""
+        x = guess._replace(u=self.problem.with_imposed(guess.u, self.fraction))
+        zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, self.fraction.dtype)
+        forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(self.evaluate, x)[0])
+        return _Iterate(
+            x=x,
+            direction=jax.tree.map(jnp.zeros_like, x),
+            contact=self.problem.initial_iterates(self.state),
+            forces=forces,
+            points=points,
+            size=far,
+            tolerance=far,
+            steps=zero,
+            krylov=zero,
+            unsolved=zero,
+            unsettled=zero,
+            finished=jnp.asarray(False),
+        )
+
+    def take_step(self, it: _Iterate) -> _Iterate:
+        """Take the step, halved until no element inverts, and evaluate the residual there."""
+
         def moved(length):
             return jax.tree.map(lambda v, d: v + length * d, it.x, it.direction)
 
         def shorten(carry):
             length, count, *_ = carry
             length = jnp.where(count == 0, 1.0, 0.5 * length)
-            return length, count + 1, *evaluate(moved(length))
+            return length, count + 1, *self.evaluate(moved(length))
 
-        def unusable(carry):
-            return ~jnp.isfinite(carry[3]) & (carry[1] <= settings.max_backtracks)
+        def inadmissible(carry):
+            return ~jnp.isfinite(carry[3]) & (carry[1] <= self.settings.max_backtracks)
 
         start = (jnp.ones_like(it.size), 0, (it.forces, it.points), jnp.full_like(it.size, jnp.inf), it.tolerance)
-        length, _, (forces, points), size, tolerance = jax.lax.while_loop(unusable, shorten, start)
-        unsettled = jnp.where(is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
-        hopeless = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
+        length, _, (forces, points), size, tolerance = jax.lax.while_loop(inadmissible, shorten, start)
+        unsettled = jnp.where(self.is_settled(size, tolerance), 0, it.unsettled + (it.steps > 0))
+        failed = (it.unsolved >= _MOST_UNSOLVED) | (unsettled >= _MOST_UNSETTLED) | ~jnp.isfinite(size)
         return it._replace(
             x=moved(length),
             contact=jax.tree.map(
@@ -167,16 +191,19 @@ def solve_increment(
             size=size,
             tolerance=tolerance,
             unsettled=unsettled,
-            finished=(size <= tolerance) | (it.steps >= settings.max_steps) | hopeless,
+            finished=(size <= tolerance) | (it.steps >= self.settings.max_steps) | failed,
         )
 
-    def find_step(it):
-        curvature = jnp.where(is_settled(it.size, it.tolerance), 1.0, 0.0)
+    def find_step(self, it: _Iterate) -> _Iterate:
+        """Linearise contact, assemble the tangent and solve for the next step."""
+        problem, state, settings = self.problem, self.state, self.settings
+        curvature = jnp.where(self.is_settled(it.size, it.tolerance), 1.0, 0.0)
         laws = problem.tangent_laws(it.points, state, it.contact, curvature)
-        r = problem.residual(problem.with_contact(it.forces, it.points, fraction, state, laws), held)
-        tangent = problem.tangent(it.x, fraction, state, laws, points=it.points)
-        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), held, settings)
-        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), held)
+        forces = problem.with_contact(it.forces, it.points, self.fraction, state, laws)
+        r = problem.residual(forces, self.hold_active)
+        tangent = problem.tangent(it.x, self.fraction, state, laws, points=it.points)
+        solution = solve_tangent(problem, tangent, jax.tree.map(jnp.negative, r), self.hold_active, settings)
+        change = problem.admissible(problem.limited(solution.x.u, settings.step_limit), self.hold_active)
         return it._replace(
             direction=solution.x._replace(u=change),
             contact=problem.follow(it.points, change, state, laws),
@@ -185,30 +212,20 @@ def solve_increment(
             unsolved=it.unsolved + (solution.iterations >= settings.krylov_steps),
         )
 
-    def step(it):
-        it = take_step(it)
-        return jax.lax.cond(it.finished, lambda it: it, find_step, it)
+    def iterate(self, it: _Iterate) -> _Iterate:
+        """Take the step of the previous pass and solve for the next: in this order the residual is compiled once."""
+        it = self.take_step(it)
+        return jax.lax.cond(it.finished, lambda it: it, self.find_step, it)
 
-    x = guess._replace(u=problem.with_imposed(guess.u, fraction))
-    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf, fraction.dtype)
-    forces, points = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(evaluate, x)[0])
-    first = _Iterate(
-        x=x,
-        direction=jax.tree.map(jnp.zeros_like, x),
-        contact=problem.initial_iterates(state),
-        forces=forces,
-        points=points,
-        size=far,
-        tolerance=far,
-        steps=zero,
-        krylov=zero,
-        unsolved=zero,
-        unsettled=zero,
-        finished=jnp.asarray(False),
-    )
-    end = jax.lax.while_loop(lambda it: ~it.finished, step, first)
+
+def solve_increment(
+    problem: AbstractProblem, state: State, guess: Unknowns, fraction: Array, hold_active: Array, settings: Newton
+) -> IncrementResult:
+    """Find equilibrium at a load fraction, from a converged state and an initial guess."""
+    increment = _Increment(problem, state, fraction, hold_active, settings)
+    end = jax.lax.while_loop(lambda it: ~it.finished, increment.iterate, increment.begin(guess))
     return IncrementResult(
-        state=problem.advance(end.x, fraction, state, held, end.forces, end.points),
+        state=problem.advance(end.x, fraction, state, hold_active, end.forces, end.points),
         converged=end.size <= end.tolerance,
         steps=end.steps,
         krylov=end.krylov,
@@ -221,17 +238,16 @@ def solve_tangent(
     problem: AbstractProblem,
     tangent: AbstractTangent,
     b: Unknowns,
-    held: Array,
+    hold_active: Array,
     settings: Newton,
     from_left: bool = False,
     preconditioned: Unknowns | None = None,
 ) -> KrylovResult:
-    """Solve one linear system with the tangent, on free unknowns without the held rigid motions, as b is.
+    """Solve one linear system with the tangent on free unknowns, without the rigid motions of the active hold.
 
-    In float32, like the tangent. Preconditioned from the left, the Krylov space of a transposed one is, too,
-    that of the preconditioned tangent, or its transpose. From the right it would hold moves that press on stiff
-    contact, for which the friction of a transposed tangent is a large force. Where the preconditioned scaled b is
-    known, it is not computed again.
+    In float32, like the tangent. Left preconditioning gives a transposed system the Krylov space of the preconditioned
+    tangent. Right preconditioning would include displacements that compress stiff contact, for which the friction of a
+    transposed tangent is a large force. A known preconditioned, scaled b is not computed again.
     """
     scale = problem.stress_scale
     b = b.scaled(scale)
@@ -240,13 +256,13 @@ def solve_tangent(
     b = jax.tree.map(lambda part: (part / size).astype(jnp.float32), b)
 
     def inside(x: Unknowns) -> Unknowns:
-        return x._replace(u=problem.project(x.u, held))
+        return x._replace(u=problem.project(x.u, hold_active))
 
     def multiply(v):
         return inside(tangent.apply(v))
 
     def precondition(v):
-        return problem.precondition(tangent, v, held)
+        return problem.precondition(tangent, v, hold_active)
 
     start = b
     if from_left and preconditioned is None:

@@ -1,6 +1,6 @@
-"""What a long call is doing: a bar on a terminal, a line of text in a notebook, lines in a log.
+"""Progress of a long call: a bar on a terminal, a line of text in a notebook, lines in a log.
 
-Everything that takes long says its stages here; what is called inside joins what called it.
+Long functions report their stages here; nested calls report to the outermost one.
 """
 
 import contextvars
@@ -12,20 +12,20 @@ from jax import monitoring
 from rich.console import Console
 from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedColumn
 
-_TICK = 0.25  # [s] between looks at what XLA does and how late it is
-_EVERY = 8.0  # [s] between lines of a log: none is silent for 10 s
-_PATIENCE = 5.0  # [s] that a stage of a library call takes before a log hears of it
-_LONG = 20.0  # [s] from which on it is said how long is left
-_NOTABLE = 3.0  # [s] of one compilation before it is mentioned; one that is kept on disk is read in less
+_TICK = 0.25  # [s] between updates of clock and compilations
+_EVERY = 8.0  # [s] between lines of a log: at least one in 10 s
+_PATIENCE = 5.0  # [s] of a stage of a library call before a log shows it
+_LONG = 20.0  # [s] of remaining time from which on it is shown
+_NOTABLE = 3.0  # [s] of one compilation before it is shown; reading one from the cache takes less
 
-# Compilations under way, by thread: when each began.
+# Start times of current compilations, by thread.
 _COMPILING: dict[int, float] = {}
 _OPEN: list["Progress"] = []
 _LOCK = threading.Lock()
 
 
 class _Now(NamedTuple):
-    """What is shown."""
+    """The displayed line."""
 
     text: str = "starting"
     fraction: float | None = None
@@ -35,15 +35,15 @@ class _Now(NamedTuple):
 
 
 class Progress:
-    """Shows what a call is doing, from `with` to its end; inside another one it adds its stages to that.
+    """Context manager that shows the progress of a call; inside another one it adds its stages to that.
 
-    Where there is neither a terminal nor a notebook it prints lines on stderr, with the seconds since it began.
-    Compilations that take long are seen and said by itself.
+    Without terminal and notebook it prints lines on stderr, with the seconds since its start. It detects and shows long
+    compilations.
 
     Args:
         wanted: Whether to show anything.
-        at_once: In a log, say each stage when it begins; else those that last long, so that many short calls are quiet.
-        alone: Calls inside show nothing: for many of a kind, of which their count tells enough.
+        at_once: In a log, show each stage at its start; else long ones only, so that many short calls print nothing.
+        alone: Nested calls show nothing: for many similar ones, which a counter represents.
     """
 
     def __init__(self, wanted: bool, *, at_once: bool = False, alone: bool = False):
@@ -80,19 +80,19 @@ class Progress:
         """Begin a stage.
 
         Args:
-            text: What is done, in a word or two.
-            compiles: What is compiled and for how long, to be said when that takes long.
+            text: Name of the stage, in a word or two.
+            compiles: Name and duration of the compilation, shown when it takes long.
         """
         if self._display is not None:
             self._display.begin(text, compiles)
 
     def show(self, text: str, fraction: float | None = None, *, estimate: bool = False) -> None:
-        """Say how far the stage is.
+        """Update the stage.
 
         Args:
-            text: What there is to say.
-            fraction: Part of the stage that is done [-], where it is known.
-            estimate: Say, too, how long the stage may still take, where that is long.
+            text: Text of the line.
+            fraction: Completed part of the stage [-], if known.
+            estimate: Show the remaining time as well, if it is long.
         """
         if self._display is not None:
             if estimate and fraction is not None:
@@ -106,7 +106,7 @@ class Progress:
 
 
 class _Display:
-    """What the outermost `Progress` and all inside share: what is shown, and a thread that keeps it up to date."""
+    """Display shared by the outermost `Progress` and all nested ones, with a thread that updates it."""
 
     def __init__(self, at_once: bool):
         _listen()
@@ -116,7 +116,7 @@ class _Display:
         self._patience = 0.0 if at_once else _PATIENCE
         self._count = 0
         self._said: tuple[int, bool] = (0, False)  # the stage of the last line, and whether it said "compiling"
-        self._paced: tuple[int, float, float] | None = None  # stage, and when a fraction of it was first heard of
+        self._paced: tuple[int, float, float] | None = None  # stage, and time of its first fraction
         self._bar: Bar | None = None
         self._handle: Any = None
         self._written = ""
@@ -129,7 +129,7 @@ class _Display:
             self._task = self._bar.add_task("starting", total=None)
             self._bar.start()
         self._ended = threading.Event()
-        # In the context of the caller, which tells a notebook the cell that a line belongs to.
+        # In the context of the caller, which identifies the notebook cell of a line.
         context = contextvars.copy_context()
         self._watch = threading.Thread(target=context.run, args=(self._keep_up,), name="opfem progress", daemon=True)
         self._watch.start()
@@ -140,7 +140,7 @@ class _Display:
         self.put(_Now(text, None, compiles, self._count, self._time()))
 
     def time_left(self, fraction: float) -> str:
-        """Say how long the stage may still take, at the pace since it was first heard of: what compiles is before."""
+        """Estimate the remaining time at the rate since the first fraction, which excludes compilation."""
         time, stage = self._time(), self.now.stage
         if self._paced is None or self._paced[0] != stage or fraction <= self._paced[2]:
             self._paced = (stage, time, fraction)
@@ -152,7 +152,7 @@ class _Display:
         return f", about {left:.0f} s left" if left < 100.0 else f", about {left / 60.0:.0f} min left"
 
     def put(self, now: _Now) -> None:
-        """Show something else."""
+        """Change the line."""
         _COMPILING.pop(threading.get_ident(), None)
         self.now = now
         if self._bar is not None or (self._patience == 0 and now.stage > self._said[0]):
@@ -166,7 +166,7 @@ class _Display:
                 self._print(text, time)
 
     def stop(self) -> None:
-        """Leave nothing behind on a terminal."""
+        """Clear the line on a terminal."""
         self._ended.set()
         self._watch.join()
         if self._bar is not None:
@@ -227,7 +227,7 @@ def _text(text: str) -> Any:
 
 
 def _listen() -> None:
-    """Hear from JAX, once, when a compilation begins and ends; it has no word for the former but these."""
+    """Register with JAX, once, for the start and end of compilations; only these events mark a start."""
     if _LISTENING:
         return
     _LISTENING.append(True)

@@ -1,4 +1,4 @@
-"""From a converged state to what users read: pressures, tractions, slip, thickness, forces."""
+"""Recovery of results from a converged state: pressures, tractions, slip, thickness, forces."""
 
 from collections.abc import Callable
 
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ..measurement import ThicknessMap
 from ..mechanics.boundary import Bodies, Body, Touching, put, take, to_touching
+from ..mechanics.contact_face import ContactFace
 from ..mechanics.contact_state import PointContact
 from ..mechanics.face import (
     area_vector,
@@ -19,7 +20,6 @@ from ..mechanics.face import (
     to_corners,
     tributary_area,
 )
-from ..mechanics.interaction import ContactFace
 from ..mechanics.interface_point import NodalField, locate
 from ..model import Compression, Imprint, Load, extreme_stretches
 from .equilibrium import Problem, State
@@ -41,7 +41,7 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
     """Recover the fields of a state, given the one its last increment started from."""
     u = state.u
     forces = problem.reactions(problem.forces(state.unknowns, state.fraction, before))
-    hold = problem.hold_force(forces, state.held)
+    hold = problem.hold_force(forces, state.hold_active)
     _, stress, _ = problem.body.fields(u, state.mean_stress)
     applied = forces.applied
     sample, sample_stats = face_result(
@@ -80,7 +80,7 @@ def recover(problem: Problem, before: State, state: State, load: Load) -> Fields
 
 
 def side_overlap(problem: Problem, state: State) -> Array:
-    """Find how far the layer's sides reach into the window or the sample [mm]."""
+    """Compute the largest overlap of the layer's sides with window or sample [mm]."""
     deepest = jnp.zeros((), state.u.dtype)
     for body, face in zip(Bodies._fields, problem.contacts, strict=True):
         if face is not None and face.imposed is None:
@@ -99,7 +99,7 @@ def reached_stretches(problem: Problem, u: Array) -> dict[str, Array]:
 def face_result(
     problem: Problem, body: Body, support: str, before: State, state: State, force: Array
 ) -> tuple[FaceResult, dict[str, Array]]:
-    """Recover what acts on one face of a body, and how near its rigid surface came."""
+    """Recover the contact fields of one face of a body, and its least clearance."""
     face, old, new = (getattr(bodies, body) for bodies in (problem.contacts, before.histories, state.histories))
     level = 0 if body == "window" else -1
     X, u = problem.positions[:, level], state.u[:, level]
@@ -132,14 +132,14 @@ def face_result(
 def at_nodes(
     face: ContactFace, point: PointContact, slip: Array, weight: Array, on_nodes: Callable[[Array], Array]
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Average contact at the points of a face over its nodes: slip [mm] and status; and how near the bodies came [mm].
+    """Average contact at the points of a face over its nodes: slip [mm] and status; and compute the approach [mm].
 
     Args:
         face: The face.
         point: Contact at its points.
-        slip: Slip so far there [mm].
-        weight: Area that the points stand for [mm²].
-        on_nodes: Integrates what the points have, per unit of (ξ, η), against the shape functions of the nodes.
+        slip: Slip since the start at its points [mm].
+        weight: Quadrature weight of the points [mm²].
+        on_nodes: Integrates values at the points, per unit of (ξ, η), with the shape functions of the nodes.
     """
     load = jnp.where(point.pressure > 0, point.pressure * weight, 0.0)
     share = on_nodes(jnp.stack([weight, load, load * point.slips], axis=1))
@@ -162,13 +162,13 @@ def at_nodes(
 
 
 def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Array, Array]:
-    """Turn nodal forces [N] of a body into pressure on the current area and traction per reference area [MPa].
+    """Convert nodal forces [N] of a body to pressure on the current area and traction per reference area [MPa].
 
     Args:
         problem: The discrete problem.
-        body: Which face they act on.
+        body: Name of the face.
         u: Displacement of that face [mm], `(3, ny+1, nx+1)`.
-        force: On the layer, same shape.
+        force: Nodal force on the layer, same shape.
     """
     cells, X = problem.body.cells.name, problem.positions[:, 0 if body == "window" else -1]
     force, area = (filled_vertices(values, cells) for values in (force, nodal_area_vector(X + u, cells)))
@@ -180,7 +180,7 @@ def per_area(problem: Problem, body: Body, u: Array, force: Array) -> tuple[Arra
 def deformed_thickness(
     X: Float[Array, "3 my mx"], u: Float[Array, "3 my mx"], load: Load | Compression
 ) -> ThicknessMap:
-    """Read the deformed interface at the load's grid points, or at the mesh's own; masked where none lies above.
+    """Sample the deformed interface at the load's grid points, or at the mesh's; masked where there is none.
 
     Args:
         X: Reference positions of the interface's nodes [mm].

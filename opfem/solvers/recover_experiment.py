@@ -1,4 +1,4 @@
-"""From the converged state of a layer and a sample to what users read."""
+"""Recovery of results from the converged state of a layer and a sample."""
 
 import dataclasses
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class ExperimentFields(eqx.Module):
 
 
 class _Single(NamedTuple):
-    """One body: its problem, the state its last increment started from, the last one, and its forces, all there."""
+    """One body: its problem, initial and final state of its last increment, and its forces at the end."""
 
     problem: Problem
     before: State
@@ -75,7 +75,7 @@ def recover_experiment(
         "max_penetration": jnp.stack([s["max_penetration"] for s in (window_stats, pair_stats, plate_stats)]).max(),
         "min_volume_ratio": jnp.minimum(lower.smallest_J, upper.smallest_J),
     }
-    # The layer's own thickness: contact with the window may leave a gap.
+    # The thickness of the layer itself: there may be a gap at the window.
     own = u[:, -1] - jnp.concatenate([jnp.zeros_like(u[:2, 0]), u[2:, 0]])
     return ExperimentFields(
         layer=_result(layer, low),
@@ -89,23 +89,23 @@ def recover_experiment(
 
 
 def _of_stack(problem: Stack, before: State, state: State) -> tuple[list[_Single], list[Array]]:
-    """Take a stack apart: its bodies, and the hold's force on each."""
+    """Split a stack into its bodies, with the hold force on each."""
     of_bodies = problem.forces(state.unknowns, state.fraction, before).bodies
     forces = [body.reactions(f) for body, f in zip(problem.bodies, of_bodies, strict=True)]
-    holds = zip(problem.bodies, forces, problem.holds(state.held), strict=True)
+    holds = zip(problem.bodies, forces, problem.holds(state.hold_active), strict=True)
     singles = zip(problem.bodies, parts(before), parts(state), forces, strict=True)
-    return [_Single(*single) for single in singles], [body.hold_force(f, held) for body, f, held in holds]
+    return [_Single(*single) for single in singles], [body.hold_force(f, hold_active) for body, f, hold_active in holds]
 
 
 def _of_block(
     block: Problem, before: State, state: State, experiment: Experiment, load: Compression
 ) -> tuple[list[_Single], list[Array]]:
-    """Cut a block at its interface: the bodies, each with the force that the other one's nodes there exert."""
-    hold = block.hold_force(block.reactions(block.forces(state.unknowns, state.fraction, before)), state.held)
+    """Split a block at its interface into bodies, each with the interface force of the other."""
+    hold = block.hold_force(block.reactions(block.forces(state.unknowns, state.fraction, before)), state.hold_active)
     contacts = Bodies(block.contacts.window, None), Bodies(None, block.contacts.sample)
     nz = experiment.layer_elements[2]
     singles = []
-    # Neither rule nor start matters: contacts are those of the block.
+    # Quadrature and start are irrelevant: contacts are those of the block.
     for own, body, nodes, elements in zip(
         contacts,
         single_bodies(experiment, load, None, "gauss2"),
@@ -120,7 +120,7 @@ def _of_block(
 
 
 def _cut(state: State, contacts: Bodies, nodes: slice, elements: slice) -> State:
-    """Take one body's part of the state of a block."""
+    """Extract one body's part of the state of a block."""
     stress = None if state.mean_stress is None else state.mean_stress[elements]
     histories = contacts.map(lambda _, __, history: history, state.histories)
     return dataclasses.replace(state, u=state.u[:, nodes], mean_stress=stress, histories=histories)

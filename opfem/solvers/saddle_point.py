@@ -4,9 +4,9 @@
     [ B -M/κ   ] [dp] = [rp]
 
 A is the stiffness at constant mean stress, B the derivative of the cells' volume and M = diag(V). The bulk
-modulus κ may be infinite. Adding γ Bᵀ M⁻¹ times the second row to the first changes no solution; the first block
-becomes A + γ Bᵀ M⁻¹ B, which a moderate γ, whatever κ is, makes stiff enough in volume for a diagonal to stand in
-for the Schur complement. GMRES removes what is left.
+modulus κ may be infinite. Augmented Lagrangian: adding γ Bᵀ M⁻¹ times the second row to the first leaves the
+solution unchanged; the first block becomes A + γ Bᵀ M⁻¹ B. For a moderate γ, at any κ, a diagonal matrix then
+approximates the Schur complement, and GMRES converges in few iterations.
 
 Source: Benzi & Olshanskii, SIAM J. Sci. Comput. 28 (2006) 2095.
 """
@@ -64,10 +64,10 @@ class SaddlePoint:
         self.augmented, self.volume, self.transposed = augmented, volume.tocsr(), volume.T.tocsr()
         self.cell_volume, self.inverse_bulk, self.penalty = cell_volume, inverse_bulk, penalty
         self._invert = factorised(augmented)
-        # What is left of Bᵀ beside its share in the augmented block, and the Schur complement -V × this.
+        # Factor of Bᵀ after augmentation, and of the Schur complement -V × this.
         self._coupling = 1.0 - penalty * inverse_bulk
         self._compliance = inverse_bulk + self._coupling / (penalty + shear)
-        # Rows are measured in square roots of energy, whatever the units.
+        # Rows are scaled to square roots of energy, independent of units.
         rows = np.abs(augmented.diagonal()), cell_volume / (penalty + shear)
         self._scale = 1.0 / np.sqrt(np.concatenate(rows))
 
@@ -80,7 +80,7 @@ class SaddlePoint:
             nonlocal iterations
             iterations += 1
 
-        # Preconditioned from the right, so that the residual is the system's own.
+        # Right preconditioning: the residual is that of the original system.
         operator = LinearOperator((b.size, b.size), lambda y: self._scale * self._apply(self._precondition(y)))
         options = {"restart": max_iterations, "maxiter": 1, "callback": count, "callback_type": "pr_norm"}
         y, failed = gmres(operator, b, rtol=rtol, atol=0.0, **options)

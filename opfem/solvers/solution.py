@@ -1,4 +1,4 @@
-"""What a solve returns: fields, status and statistics."""
+"""Result of a solve: fields, status and statistics."""
 
 import dataclasses
 import functools
@@ -18,11 +18,11 @@ OPEN, STICK, SLIP = 0, 1, 2
 
 
 class RESULTS(eqx.Enumeration):
-    """How a solve ended. Anything but what `CONVERGED` names leaves NaN fields."""
+    """Status of a solve. Fields are NaN unless it is one of `CONVERGED`."""
 
     successful = ""
     slides_off = (
-        "Converged, but only because the in-plane hold carries a lateral force: friction cannot. "
+        "Converged, but only because the in-plane hold balances a lateral force: friction cannot. "
         "stats['force_hold'] says how much."
     )
     increment_too_small = (
@@ -52,16 +52,16 @@ class RESULTS(eqx.Enumeration):
 
 
 CONVERGED = ("successful", "slides_off", "kinetic_energy_high", "material_unstable")
-"""How a solve ends that has reached its load."""
+"""Statuses of solves that reached their load."""
 
 
 def is_failure(result: RESULTS) -> Bool[Array, ""]:
-    """Tell whether a solve has not reached its load."""
+    """Return whether a solve has not reached its load."""
     return ~functools.reduce(jnp.logical_or, [result == getattr(RESULTS, name) for name in CONVERGED])
 
 
 def judged(solution: "AnySolution") -> "AnySolution":
-    """Note in stats and status where a solve stretched elements beyond what its law is stable or calibrated for."""
+    """Report in stats and status stretches beyond the stable or calibrated range of the law."""
     stats = solution.stats
     layer = solution.palpation.layer if isinstance(solution, Solution) else solution.experiment.layer
     unstable = unstable_stretch(layer.material, stats["min_stretch"], stats["max_stretch"])
@@ -79,7 +79,7 @@ def judged(solution: "AnySolution") -> "AnySolution":
 
 
 class FaceResult(eqx.Module):
-    """What acts on one face of the layer, at its nodes `(ny+1, nx+1)`.
+    """Contact fields on one face of the layer, at its nodes `(ny+1, nx+1)`.
 
     Attributes:
         pressure: Contact pressure -n·σn on the current area [MPa], positive in compression.
@@ -99,8 +99,8 @@ class LastConverged(eqx.Module):
 
     Attributes:
         displacement: `(3, nz+1, ny+1, nx+1)` [mm]; of an experiment, the layer's and the sample's.
-        load_fraction: How much of the load it carries [-].
-        state: The same with its friction history, for `solve(..., start=)`.
+        load_fraction: Load fraction reached [-].
+        state: The state with its friction history, for `solve(..., start=)`.
     """
 
     displacement: PyTree[Float[Array, "3 _ _ _"]]
@@ -114,13 +114,13 @@ class Solution(eqx.Module):
     Attributes:
         displacement: `(3, nz+1, ny+1, nx+1)` [mm].
         positions: Reference positions of the nodes, same shape [mm].
-        sample: What acts at the sample–layer interface.
-        window: What acts at the window.
+        sample: Contact fields at the sample–layer interface.
+        window: Contact fields at the window.
         thickness: Deformed interface as a spatial map on the load's grid [mm], masked where no
             interface point lies above.
         stress_zz: Cauchy stress σ_zz, mean over each top element `(ny, nx)` [MPa].
         stats: Iterations, residual, energies, forces [N]; see `solve`.
-        result: How the solve ended.
+        result: Status of the solve.
         last_converged: The last converged state and its load fraction.
         palpation: The experiment that was solved.
         load: Its load.
@@ -140,7 +140,7 @@ class Solution(eqx.Module):
 
     @property
     def interface(self) -> FaceResult:
-        """What acts at the sample–layer interface."""
+        """Contact fields at the sample–layer interface."""
         return self.sample
 
     @property
@@ -172,8 +172,8 @@ class BodyResult(eqx.Module):
         positions: Reference positions of the nodes, same shape [mm].
         mean_stress: Mean stress of "hybrid" elements `(nz, ny, nx)` [MPa]; None for others.
         stress: Cauchy stress, mean over each element `(3, 3, nz, ny, nx)` [MPa].
-        min_stretch: Smallest principal stretch, volume change taken out [-].
-        max_stretch: Largest.
+        min_stretch: Smallest principal stretch, without volume change [-].
+        max_stretch: Largest principal stretch, without volume change [-].
     """
 
     displacement: Float[Array, "3 mz my mx"]
@@ -185,17 +185,17 @@ class BodyResult(eqx.Module):
 
 
 class ExperimentSolution(eqx.Module):
-    """The solved experiment: what a `Solution` says of the layer and its interface, and both bodies.
+    """The solved experiment: the fields of a `Solution` for the layer and its interface, and both bodies.
 
     Attributes:
         layer: The layer.
         sample: The sample.
-        window: What acts on the layer at the window.
-        interface: What acts on the layer at its interface with the sample.
-        plate: What acts on the sample at the plate.
+        window: Contact fields of the layer at the window.
+        interface: Contact fields of the layer at its interface with the sample.
+        plate: Contact fields of the sample at the plate.
         thickness: Thickness of the deformed layer as a spatial map on the interface's nodes [mm], as OCT sees it.
         stats: Iterations, residual, energies, forces [N]; see `solve`.
-        result: How the solve ended.
+        result: Status of the solve.
         last_converged: The last converged state and its load fraction.
         experiment: The experiment that was solved.
         load: Its load.

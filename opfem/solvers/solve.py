@@ -81,23 +81,21 @@ def solve(
         throw: Raise where the solve fails. False: return NaN fields, the status in `result`
             and the last converged state in `last_converged`.
         start: Continue from this solution, with its friction history.
-        progress: Say what is done, on a terminal, in a notebook or, where it takes long, on stderr; never inside jit.
+        progress: Show progress on a terminal, in a notebook or, for long solves, on stderr; never inside jit.
 
     Returns:
-        The solution. `stats` holds `newton_steps`, `krylov_steps`, `increments`, `attempts`,
-        `residual` (unbalanced force over contact force), `load_fraction`, `strain_energy` and
-        `friction_dissipation` [N mm], `force_sample`, `force_window`, `force_hold` `(3,)` [N] on
-        the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N mm] about the origin,
-        `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
+        The solution. `stats` contains `newton_steps`, `krylov_steps`, `increments`, `attempts`, `residual` (unbalanced
+        force over contact force), `load_fraction`, `strain_energy` and `friction_dissipation` [N mm], `force_sample`,
+        `force_window`, `force_hold` `(3,)` [N] on the layer, `moment_sample`, `moment_window`, `moment_hold` `(3,)` [N
+        mm] about the origin, `work_sample`, `work_window` [N mm] done on the layer along the increments, `approach` and
         `max_penetration` and `side_overlap` [mm], `min_volume_ratio` [-], `min_stretch` and `max_stretch` (principal
-        stretches, volume change taken out) and `unstable_stretch` [-] (from which on the material
-        law is unstable, 0 if it was stable as far as it was stretched). With a law from `calibrate`
-        `beyond_calibration` [-]: by how much of themselves stretches left those of the tests, 0 if
-        they did not. Of an experiment `force_sample`
-        is that on the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
+        stretches, without volume change) and `unstable_stretch` [-] (stretch at which the material law becomes
+        unstable, 0 if it is stable over the stretches reached). With a law from `calibrate` `beyond_calibration` [-]:
+        relative excess of stretches over those of the tests, 0 within them. Of an experiment `force_sample` is that on
+        the layer at its interface, `force_plate` and `work_plate` are the plate's on the sample.
 
     Raises:
-        ValueError: If load and palpation contradict each other, or numbers are float32.
+        ValueError: If load and palpation are incompatible, or numbers are float32.
         ConvergenceError: If the solve fails and `throw` is True.
     """
     load_start = None if start is None else start.load
@@ -129,7 +127,7 @@ def solve(
 
 
 def _check_memory(palpation: Palpation | Experiment) -> None:
-    """Warn before a solve that needs more memory than there is."""
+    """Warn before a solve that needs more memory than is available."""
     elements = float(np.sum(np.prod(np.atleast_2d(palpation.elements), axis=1)))  # of one body, or of both
     needed, there = _BYTES_PER_ELEMENT * elements, memory()
     if there is not None and needed > there:
@@ -142,7 +140,7 @@ def _check_memory(palpation: Palpation | Experiment) -> None:
 
 @QuickJit
 def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[AbstractProblem, Stepping]:
-    """Discretise a palpation or an experiment under a load, and begin at a state or at rest."""
+    """Discretise a palpation or an experiment under a load, and initialise the load stepping at a state or at rest."""
     if isinstance(palpation, Experiment):
         problem = discretise_experiment(palpation, load, load_start, solver.face_rule)
     else:
@@ -151,7 +149,7 @@ def prepare(palpation, load, load_start, solver, state: State | None, traced: bo
     if state is None:
         stepping = begin(initial, solver, traced)
         if isinstance(palpation, Experiment):
-            stepping = stepping._replace(before=touching(problem, initial, stepping.increment))
+            stepping = stepping._replace(before=touching(problem, initial, stepping.increments.size))
         return problem, stepping
     if jax.tree.structure(state) != jax.tree.structure(initial):
         raise ValueError(
@@ -171,7 +169,7 @@ _compiled_follow_path = QuickJit(follow_path)
 def _run_with_progress(problem: AbstractProblem, stepping: Stepping, solver: Newton, bar: Progress) -> Stepping:
     while bool(unfinished(stepping)):
         stepping = compiled_attempt(problem, stepping, solver)
-        fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.viscosity > 0) else ""
+        fraction, snaps = float(stepping.state.fraction), ", snapping" if bool(stepping.snap.viscosity > 0) else ""
         bar.show(f"load {100 * fraction:.0f} %, {int(stepping.newton)} Newton steps{snaps}", fraction, estimate=True)
     return stepping
 
@@ -182,33 +180,36 @@ def _run_differentiable(problem: AbstractProblem, stepping: Stepping, solver: Ne
         end = jax.lax.while_loop(unfinished, lambda s: attempt(frozen, s, settings), start)
     else:  # differentiated, but not part of a larger program
         end = _run_with_progress(frozen, start, settings, bar)
-    assert end.path is not None
-    before, state = _compiled_follow_path(problem, stepping.state, end.path, end.kept, settings)
-    return end._replace(before=before, state=state, path=None)
+    assert end.path.solves is not None
+    before, state = _compiled_follow_path(problem, stepping.state, end.path.solves, end.path.kept, settings)
+    return end._replace(before=before, state=state, path=end.path._replace(solves=None))
 
 
 def _correct_approach(palpation, load, solver, problem, stepping, run, bar) -> tuple[AbstractProblem, Stepping]:
-    """Shift the rigid surface by the approach its own pressure causes, and solve again from here."""
+    """Shift the rigid surface by the approach that its pressure causes, and solve again from this state."""
     for _ in range(2):
         offset = palpation.sample.law.zero_pressure_clearance - _approach(problem, stepping, load)
         shifted = eqx.tree_at(lambda p: p.contacts.sample.offset, problem, offset)
-        # The surface is in place; what is left is one increment at the full load.
+        # The surface moves by the approach only: one increment at the full load.
         again = begin(stepping.state, solver, run is _run_differentiable)
-        state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increment)
+        state = eqx.tree_at(lambda s: s.fraction, stepping.state, 1.0 - again.increments.size)
         again = again._replace(
             state=state,
             before=state,
             origin=state,
-            can_release=stepping.can_release,
-            release_failed=stepping.release_failed,
+            hold=again.hold._replace(can_release=stepping.hold.can_release, failed=stepping.hold.failed),
         )
-        stepping_next = run(shifted, again, solver, bar)
-        totals = {
-            name: getattr(stepping, name) + getattr(stepping_next, name)
-            for name in ("attempts", "increments", "newton", "krylov")
-        }
-        problem, stepping = shifted, stepping_next._replace(**totals)
+        problem, stepping = shifted, _with_work_of(stepping, run(shifted, again, solver, bar))
     return problem, stepping
+
+
+def _with_work_of(first: Stepping, second: Stepping) -> Stepping:
+    """Add the counts of a first solve to those of a second one."""
+    counts = second.increments._replace(
+        attempts=first.increments.attempts + second.increments.attempts,
+        accepted=first.increments.accepted + second.increments.accepted,
+    )
+    return second._replace(increments=counts, newton=first.newton + second.newton, krylov=first.krylov + second.krylov)
 
 
 @QuickJit
@@ -218,13 +219,13 @@ def _approach(problem: Any, s: Stepping, load: Load) -> Array:
 
 @QuickJit
 def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
-    """Make the solution from where a solve ended."""
+    """Build the solution from the final state of the load stepping."""
     ok = s.state.fraction >= 1.0
     counts = {
         "newton_steps": s.newton,
         "krylov_steps": s.krylov,
-        "increments": s.increments,
-        "attempts": s.attempts,
+        "increments": s.increments.accepted,
+        "attempts": s.increments.attempts,
         "residual": s.residual,
         "load_fraction": s.state.fraction,
     }
@@ -292,7 +293,7 @@ def _raise_on_failure(solution: AnySolution, traced: bool) -> AnySolution:
 
 
 def require_float64(caller: str, **inputs: Any) -> None:
-    """Raise ValueError where numbers are not float64: the first such input, by its name, and what to do."""
+    """Raise ValueError for the first input whose numbers are not float64, with advice."""
     for name, part in inputs.items():
         for path, leaf in jax.tree_util.tree_leaves_with_path(part):
             if not eqx.is_inexact_array(leaf) or leaf.dtype == jnp.dtype("float64"):

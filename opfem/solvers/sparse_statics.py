@@ -28,17 +28,17 @@ _pressure_stiffness = eqx.filter_jit(lambda load, x: load.stiffness(x))
 
 
 class StaticProblem(NamedTuple):
-    """A body and what acts on it at full load.
+    """A body with its supports and loads at full load.
 
     Attributes:
         body: The body, on unstructured cells.
         points: Reference positions of the nodes `(3, nodes)` [mm].
-        fixed: Components whose displacement is prescribed `(3, nodes)`.
+        fixed: Mask of prescribed displacement components `(3, nodes)`.
         displacement: Prescribed displacement `(3, nodes)` [mm]; read where `fixed`.
         force: Dead forces on the nodes `(3, nodes)` [N]; None: none.
         pressure: Follower pressure; None: none.
-        control: Weights c `(3, nodes)` and value d of a displacement that replaces the load as what is
-            given: sum(c u) = d [mm] at the end, and `load_factor` times force and pressure is found.
+        control: Displacement control: weights c `(3, nodes)` and value d with sum(c u) = d [mm] at the end; the
+            `load_factor` on force and pressure is then unknown.
     """
 
     body: SolidBody
@@ -51,17 +51,17 @@ class StaticProblem(NamedTuple):
 
 
 class StaticSettings(NamedTuple):
-    """How hard to try.
+    """Settings of the solver.
 
     Attributes:
-        increments: Load increments to start with.
+        increments: Initial number of load increments.
         rtol: Largest out-of-balance force, relative to all nodal forces; also the largest error of a
             cell's volume, relative to the cell.
         max_steps: Newton steps of an increment before it is cut.
         max_cuts: The smallest increment is the first one cut to a quarter this many times.
         penalty: γ of the hybrid form, in shear moduli.
         krylov_rtol: Residual of the hybrid form's linear solves, relative.
-        max_krylov: Most iterations of one of them.
+        max_krylov: Limit of iterations of one solve.
     """
 
     increments: int = 1
@@ -74,15 +74,15 @@ class StaticSettings(NamedTuple):
 
 
 class StaticSolution(NamedTuple):
-    """The last equilibrium that was found; at full load only if `status` is "successful".
+    """The last equilibrium; at full load only if `status` is "successful".
 
     Attributes:
         displacement: `(3, nodes)` [mm].
         mean_stress: Of each cell in the hybrid form `(cells,)` [MPa], tension positive; else None.
         status: "successful" or "increment_too_small".
-        load_fraction: Share of the load that is reached, 1 if successful.
+        load_fraction: Load fraction reached, 1 if successful.
         load_factor: Factor on force and pressure; differs from `load_fraction` under `control`.
-        reaction: Force that holds the prescribed components `(3, nodes)` [N]; zero elsewhere.
+        reaction: Reaction of the prescribed components `(3, nodes)` [N]; zero elsewhere.
         smallest_J: Smallest volume ratio of any point [-].
         residuals: Relative out-of-balance force of every Newton step, by increments.
         krylov_iterations: Of every Newton step's linear solves, by increments; empty unless hybrid.
@@ -117,7 +117,7 @@ class _Step(NamedTuple):
     state: _State
     balance: _Balance
     iterations: int
-    whole: bool  # not shortened, so the prescribed displacement is reached
+    whole: bool  # a whole step: the prescribed displacement is reached
 
 
 def solve_statics(
@@ -127,8 +127,8 @@ def solve_statics(
 
     Args:
         problem: The body and its loads.
-        settings: How hard to try.
-        throw: Raise if full load is not reached; else the last equilibrium comes back with its status.
+        settings: Settings.
+        throw: Raise if full load is not reached; False: return the last equilibrium with its status.
 
     Returns:
         The equilibrium.
@@ -270,7 +270,7 @@ class _Linearised:
             load = _sparse(load, own[:, :, :, None, None], own[:, None, None], (size, size))
             matrix = matrix - state.factor * load
         rows = matrix[self.free]
-        block, self.held = rows[:, self.free].tocsc(), rows[:, ~self.free]
+        block, self.prescribed = rows[:, self.free].tocsc(), rows[:, ~self.free]
         if not hybrid:
             self._invert = factorised(block)
             return
@@ -283,11 +283,11 @@ class _Linearised:
     def solve(self, ru: np.ndarray, rp: np.ndarray | None, given: np.ndarray) -> LinearSolution:
         """Solve for the displacement `(3, nodes)` of which `given` is prescribed, and the mean stress."""
         known = given.T.ravel()[~self.free]
-        right = ru.T.ravel()[self.free] - self.held @ known
+        right = ru.T.ravel()[self.free] - self.prescribed @ known
         if rp is None:
             solution = LinearSolution(self._invert(right), np.zeros(()), 0, True)
         else:
-            # `held` is augmented too: what it takes of γ Bᵀ M⁻¹ B is given back.
+            # The columns of prescribed unknowns are augmented as well: their part of γ Bᵀ M⁻¹ B is compensated.
             volume = self.held_volume @ known
             right = right + self.penalty * (self.system.transposed @ (volume / self.cell_volume))
             solution = self.system.solve(right, rp - volume, self.settings.krylov_rtol, self.settings.max_krylov)
@@ -303,7 +303,7 @@ def _cells(body: SolidBody) -> UnstructuredCells:
 
 
 def _unknowns(nodes: np.ndarray) -> np.ndarray:
-    """Give the numbers of the displacements of nodes `(a, e)` counted node by node: `(a, 3, e)`."""
+    """Return the indices of the displacements of nodes `(a, e)`, numbered node by node: `(a, 3, e)`."""
     return 3 * nodes[:, None].astype(np.int32) + np.arange(3, dtype=np.int32)[:, None]
 
 

@@ -1,8 +1,8 @@
-"""Two deformable bodies on top of each other, each with its rigid surfaces, in contact: the discrete problem.
+"""The discrete problem of two deformable bodies in contact with each other, each with its rigid surfaces.
 
-The linear systems of a stack are preconditioned body by body (block Gauss–Seidel): the lower one with all of its
-contact springs, which stand at its own face points and so are exact there, then the upper one almost without. Columns
-through both bodies would be spoilt as soon as the bodies slide.
+Block Gauss–Seidel preconditions the linear systems body by body: the lower one with the full contact stiffness, exact
+at the quadrature points of its face; then the upper one with nearly none. Column blocks through both bodies would lose
+their structure once the bodies slide.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,14 +15,15 @@ from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.boundary import Touching, put, take, to_touching
 from ..mechanics.contact_pair import ContactPair, PairForce
-from .equations import AbstractProblem, HoldBalance, State
+from .equations import AbstractProblem, State
 from .equilibrium import Forces, Problem, single
+from .in_plane_hold import HoldBalance
 from .stencil import Nodal
 from .tangent import Tangent, Unknowns
 
-# V-cycles of the lower body for one of the upper one. What is left of stiff contact after one would count against the
-# upper body's soft springs: on 12×12×(2+6) elements with the exponential law and friction 0.05, one, three with
-# friction's coupling left out, and three with it take 96, 77 and 24 iterations a Newton step.
+# V-cycles of the lower body for one of the upper one: the residual of stiff contact after one dominates the soft
+# contact stiffness of the upper body. On 12×12×(2+6) elements with the exponential law and friction 0.05, one cycle,
+# three without frictional coupling, and three with it take 96, 77 and 24 iterations per Newton step.
 _LOWER_CYCLES = 3
 
 UpperNodal = Float[Array, "3 uz uy ux"]
@@ -35,7 +36,7 @@ class StackForces(NamedTuple):
 
     @property
     def own(self) -> Unknowns:
-        """Internal forces [N] and missed volume, which derive from an energy."""
+        """Internal forces [N] and volume residual, the derivative of an energy."""
         return Unknowns(tuple(f.internal for f in self.bodies), tuple(f.volume for f in self.bodies))
 
     def with_own(self, own: Unknowns) -> "StackForces":
@@ -56,7 +57,7 @@ class Stack(AbstractProblem):
         lower: The lower body; its upper face, "sample", is in contact with the upper body.
         upper: The upper body; its lower face, "window", is in contact with the lower body.
         pair: The contact between them.
-        viscosity: Of the medium that slows both on their way through a snap [-], else 0.
+        viscosity: Viscous regularisation during a snap-through [-], else 0.
     """
 
     lower: Problem
@@ -67,7 +68,7 @@ class Stack(AbstractProblem):
 
     @property
     def bodies(self) -> tuple[Problem, Problem]:
-        """The bodies, lower first, in the medium."""
+        """The bodies, lower first, with the viscosity."""
         lower, upper = (eqx.tree_at(lambda b: b.viscosity, b, self.viscosity) for b in (self.lower, self.upper))
         return lower, upper
 
@@ -88,26 +89,27 @@ class Stack(AbstractProblem):
 
     @property
     def stress_scale(self) -> Array:
-        """Mean stress that weighs as much as a displacement of 1 mm [MPa/mm]; times volume, a force."""
+        """Scale of mean stress over displacement in norms [MPa/mm]; times volume, a force."""
         return self.lower.stress_scale
 
-    def holds(self, held: Array) -> tuple[Array, Array]:
-        """Tell whether rigid motion of each body is held, given whether friction between them has not taken over.
+    def holds(self, hold_active: Array) -> tuple[Array, Array]:
+        """Return whether the hold of each body is active, from whether that of the stack is.
 
-        Friction between the bodies never holds both: without any at window and plate the lower one stays held.
+        Friction between the bodies cannot constrain both: without friction at window and plate the hold of the lower
+        body remains active.
         """
         if self.lower.drift_modes is None or self.upper.drift_modes is None:
-            return held, held
+            return hold_active, hold_active
         ends = [face for face in (self.lower.contacts.window, self.upper.contacts.sample) if face is not None]
         rubs = [face.own_contact.friction > 0 for face in ends]
-        return held | ~jnp.any(jnp.stack([jnp.asarray(False), *rubs])), held
+        return hold_active | ~jnp.any(jnp.stack([jnp.asarray(False), *rubs])), hold_active
 
     def own_forces(self, x: Unknowns, state: State) -> StackForces:
-        """Compute the forces of bodies, medium and springs [N], none applied."""
+        """Compute internal, viscous and hold-spring forces [N], without applied ones."""
         return StackForces(tuple(body.own_forces(own, at) for body, own, at in self._each(x, state)))
 
     def locate(self, u: PyTree, fraction: Array, state: State, bends: bool = False) -> tuple:
-        """Locate the points of all contacts: of each body with its rigid surfaces, and between them."""
+        """Locate the points of all contacts: of each body with its rigid surfaces, and between the bodies."""
         own = [body.locate(v, fraction, at, bends) for body, v, at in zip(self.bodies, u, parts(state), strict=True)]
         pair = self.pair.locate(fraction, self._lower_corners(u), self._upper_nodes(u), state.histories[2])
         return (*own, pair)
@@ -115,7 +117,7 @@ class Stack(AbstractProblem):
     def with_contact(
         self, forces: StackForces, points: tuple, fraction: Array, state: State, laws: tuple | None = None
     ) -> StackForces:
-        """Replace the applied forces by those of linearised contact laws; without, the contact's own."""
+        """Replace the applied forces by those of linearised contact laws; None: of the nonlinear laws."""
         laws = laws or (None, None, None)
         own = [
             body.with_contact(f, at, fraction, before, law)
@@ -136,7 +138,7 @@ class Stack(AbstractProblem):
         return (*own, self.pair.tangent_law(points[2], state.histories[2], iterates[2], curvature))
 
     def follow(self, points: tuple, change: PyTree, state: State, laws: tuple) -> tuple:
-        """Compute what the next iteration remembers once a part of the step `change` is taken."""
+        """Update the contact iterate after a part of the step `change`."""
         own = [
             body.follow(at, step, before, law)
             for body, at, step, before, law in zip(self.bodies, points[:2], change, parts(state), laws[:2], strict=True)
@@ -145,35 +147,38 @@ class Stack(AbstractProblem):
         return (*own, self.pair.follow(points[2], corners, upper, state.histories[2], laws[2]))
 
     def initial_iterates(self, state: State) -> tuple:
-        """Start the iteration from the contact of a converged state."""
+        """Initialise the contact iterate from a converged state."""
         own = [body.initial_iterates(before) for body, before in zip(self.bodies, parts(state), strict=True)]
         return (*own, self.pair.face.initial_iterate(state.histories[2]))
 
     def missed_gap(self, before: State, after: State) -> Array:
-        """Compute the largest gap or penetration [mm] that an increment left to hard contact."""
+        """Compute the largest gap or penetration [mm] of hard contact after an increment."""
         gaps = [
             body.missed_gap(*states) for body, *states in zip(self.bodies, parts(before), parts(after), strict=True)
         ]
         gaps.append(self.pair.face.missed_gap(before.histories[2], after.histories[2]))
         return jnp.max(jnp.stack(gaps))
 
-    def residual(self, forces: StackForces, held: Array) -> Unknowns:
-        """Compute the unbalanced force [N] of the free unknowns, the hold's share taken out."""
+    def residual(self, forces: StackForces, hold_active: Array) -> Unknowns:
+        """Compute the unbalanced force [N] of the free unknowns, without the part that the hold balances."""
         rest = [
-            body.residual(f, own) for body, f, own in zip(self.bodies, forces.bodies, self.holds(held), strict=True)
+            body.residual(f, own)
+            for body, f, own in zip(self.bodies, forces.bodies, self.holds(hold_active), strict=True)
         ]
         return Unknowns(tuple(r.u for r in rest), tuple(r.mean_stress for r in rest))
 
-    def project(self, r: PyTree, held: Array) -> PyTree:
-        """Take the held rigid motions of each body out of nodal fields."""
-        return tuple(body.project(v, own) for body, v, own in zip(self.bodies, r, self.holds(held), strict=True))
+    def project(self, r: PyTree, hold_active: Array) -> PyTree:
+        """Project the rigid motions of each body's active hold out of nodal fields."""
+        return tuple(body.project(v, own) for body, v, own in zip(self.bodies, r, self.holds(hold_active), strict=True))
 
-    def without_drift(self, u: PyTree, held: Array) -> PyTree:
-        """Move each body as a whole so that its lower face has none of the held rigid motions."""
-        return tuple(body.without_drift(v, own) for body, v, own in zip(self.bodies, u, self.holds(held), strict=True))
+    def without_drift(self, u: PyTree, hold_active: Array) -> PyTree:
+        """Translate and rotate each body until its lower face has no rigid motion of the active hold."""
+        return tuple(
+            body.without_drift(v, own) for body, v, own in zip(self.bodies, u, self.holds(hold_active), strict=True)
+        )
 
     def limited(self, change: PyTree, step_limit: float | int | Array) -> PyTree:
-        """Shorten the moves of single nodes that stand out of a step."""
+        """Limit the outliers of a step: displacements of single nodes."""
         return tuple(body.limited(v, step_limit) for body, v in zip(self.bodies, change, strict=True))
 
     def with_imposed(self, u: PyTree, fraction: Array) -> PyTree:
@@ -181,12 +186,12 @@ class Stack(AbstractProblem):
         return tuple(body.with_imposed(v, fraction) for body, v in zip(self.bodies, u, strict=True))
 
     def force_scale(self, forces: StackForces) -> Array:
-        """Compute the size of the forces [N] that the residual is measured against."""
+        """Compute the force scale of the residual [N]."""
         scales = [body.force_scale(f) for body, f in zip(self.bodies, forces.bodies, strict=True)]
         return jnp.sqrt(scales[0] ** 2 + scales[1] ** 2)
 
     def hold_balances(self, forces: StackForces, state: State) -> Sequence[HoldBalance]:
-        """Compare what the hold carries of each body with what friction could, and with the normal force."""
+        """Compute the hold force of each body, the friction that could replace it, and the normal force."""
         between = self.pair.face.own_contact.friction * jnp.abs(forces.bodies[0].applied.sample.total[2])
         balances = [
             balance._replace(capacity=balance.capacity + between)
@@ -202,14 +207,14 @@ class Stack(AbstractProblem):
         x: Unknowns,
         fraction: Array,
         state: State,
-        held: Array,
+        hold_active: Array,
         forces: StackForces,
         points: tuple | None = None,
     ) -> State:
         """Build the state at the end of an increment, friction history included."""
         points = points or self.locate(x.u, fraction, state)
         own = [
-            body.advance(v, fraction, before, held, f, at)
+            body.advance(v, fraction, before, hold_active, f, at)
             for (body, v, before), f, at in zip(self._each(x, state), forces.bodies, points[:2], strict=True)
         ]
         return joined(own, self.pair.advance(points[2], state.histories[2]))
@@ -233,20 +238,20 @@ class Stack(AbstractProblem):
             between = _transposed(between, corners, upper)
         full, soft = pair.guards(at, upper, history, law)
         own = [
-            body.tangent(v, fraction, before, law, transposed, at, {face: springs}, self.stress_scale)
-            for (body, v, before), law, at, face, springs in zip(
+            body.tangent(v, fraction, before, law, transposed, at, {face: coupling}, self.stress_scale)
+            for (body, v, before), law, at, face, coupling in zip(
                 self._each(x, state), laws[:2], points[:2], ("sample", "window"), (full, soft), strict=True
             )
         ]
         return StackTangent((own[0], own[1]), between, transposed)
 
-    def precondition(self, tangent: "StackTangent", r: Unknowns, held: Array) -> Unknowns:
-        """Solve the lower body, then the upper one with what that pushes; the other way round where transposed.
+    def precondition(self, tangent: "StackTangent", r: Unknowns, hold_active: Array) -> Unknowns:
+        """Solve the lower body, then the upper one with the resulting contact force; in reverse order where transposed.
 
-        Held rigid motions are taken out body by body: one body's would press on the other.
+        Rigid motions of the hold are projected out body by body: those of one body would compress the other.
         """
         lower, upper = _split(jax.tree.map(lambda part: part.astype(jnp.float32), r))
-        holds_lower, holds_upper = self.holds(held)
+        holds_lower, holds_upper = self.holds(hold_active)
 
         if tangent.is_transposed:
             above = self.upper.precondition(tangent.bodies[1], upper, holds_upper)
@@ -258,14 +263,14 @@ class Stack(AbstractProblem):
         upper = upper._replace(u=self.upper.project(upper.u + push, holds_upper))
         return _together([below, self.upper.precondition(tangent.bodies[1], upper, holds_upper)])
 
-    def _solve_lower(self, tangent: "StackTangent", r: Unknowns, held: Array) -> Unknowns:
-        """Solve the lower body against a fixed upper one, friction's coupling included, by V-cycles."""
+    def _solve_lower(self, tangent: "StackTangent", r: Unknowns, hold_active: Array) -> Unknowns:
+        """Solve the lower body against a fixed upper one, frictional coupling included, by V-cycles."""
         body, still = tangent.bodies[0], jnp.zeros(self.upper.positions.shape, jnp.float32)
 
         def improve(_, x):
             rest = jax.tree.map(jnp.subtract, r, body.apply(x))
-            rest = rest._replace(u=self.lower.project(rest.u + tangent.push(x.u, still)[0], held))
-            return jax.tree.map(jnp.add, x, self.lower.precondition(body, rest, held))
+            rest = rest._replace(u=self.lower.project(rest.u + tangent.push(x.u, still)[0], hold_active))
+            return jax.tree.map(jnp.add, x, self.lower.precondition(body, rest, hold_active))
 
         return jax.lax.fori_loop(0, _LOWER_CYCLES, improve, jax.tree.map(jnp.zeros_like, r))
 
@@ -276,7 +281,7 @@ class Stack(AbstractProblem):
         return joined(own, self.pair.initial_history(corners))
 
     def _each(self, x: Unknowns, state: State) -> list[tuple[Problem, Unknowns, State]]:
-        """Go through the bodies, what is unknown of each, and its own state."""
+        """Iterate over the bodies, with the unknowns and the state of each."""
         own = [Unknowns(u, stress) for u, stress in zip(x.u, x.mean_stress, strict=True)]
         return list(zip(self.bodies, own, parts(state), strict=True))
 
@@ -291,10 +296,10 @@ class StackTangent(NamedTuple):
     """The linear operator of one Newton step of a stack, in float32, and the parts of its preconditioner.
 
     Attributes:
-        bodies: Of each body alone, lower first; the springs of contact between them only in their preconditioners.
-        between: Change of the forces of contact between them by the motion of the lower face's corners and of the upper
+        bodies: Operator of each body, lower first; mutual contact stiffness is in their preconditioners only.
+        between: Derivative of the mutual contact forces by displacements of the lower face's corners and the upper
             face's nodes; transposed where the operator is.
-        is_transposed: Whether it is.
+        is_transposed: Whether the operator is transposed.
     """
 
     bodies: tuple[Tangent, Tangent]
@@ -302,13 +307,13 @@ class StackTangent(NamedTuple):
     is_transposed: bool
 
     def apply(self, x: Unknowns) -> Unknowns:
-        """Multiply with unknowns."""
+        """Compute the product with unknowns."""
         own = [body.apply(v) for body, v in zip(self.bodies, _split(x), strict=True)]
         pushed = self.push(x.u[0], x.u[1])
         return _together([f._replace(u=f.u - push) for f, push in zip(own, pushed, strict=True)])
 
     def push(self, lower: Nodal, upper: UpperNodal) -> tuple[Nodal, UpperNodal]:
-        """Compute how forces of contact between the bodies change with their motion."""
+        """Compute the change of the mutual contact forces with displacements."""
         lower, upper = (_inside(v, body) for v, body in zip((lower, upper), self.bodies, strict=True))
         force = self.between(take(lower, "sample", with_sides=False), upper[:, 0])
         nz, ny, nx = (n - 1 for n in lower.shape[1:])
@@ -318,14 +323,14 @@ class StackTangent(NamedTuple):
 
 
 def parts(state: State) -> list[State]:
-    """Take the states of the bodies out of that of a stack."""
+    """Extract the states of the bodies from that of a stack."""
     return [
         State(
             state.u[k],
             state.mean_stress[k],
             state.fraction,
             state.histories[k],
-            state.held,
+            state.hold_active,
             state.applied[k],
             state.work[k],
         )
@@ -334,14 +339,14 @@ def parts(state: State) -> list[State]:
 
 
 def joined(bodies: Sequence[State], between: Any) -> State:
-    """Make the state of a stack of those of its bodies, and of the history of the contact between them."""
+    """Combine the states of the bodies and the history of their mutual contact into that of a stack."""
     first = bodies[0]
     return State(
         u=tuple(s.u for s in bodies),
         mean_stress=tuple(s.mean_stress for s in bodies),
         fraction=first.fraction,
         histories=(*(s.histories for s in bodies), between),
-        held=first.held,
+        hold_active=first.hold_active,
         applied=tuple(s.applied for s in bodies),
         work=tuple(s.work for s in bodies),
     )

@@ -1,8 +1,7 @@
 """The assembled tangent as a block stencil: 27 blocks of 3×3 per node, no scatter.
 
-Element matrices are `(nz, 8 a, 8 b, 3, 3, ny, nx)`; assembling overlaps them one axis after
-the other. `S[dz, 3 dy + dx, i, j]` couples component i of a node with component j of its
-neighbour at offset (dz - 1, dy - 1, dx - 1).
+Element matrices are `(nz, 8 a, 8 b, 3, 3, ny, nx)`; assembly sums them one axis at a time. `S[dz, 3 dy + dx, i, j]`
+couples component i of a node with component j of its neighbour at offset (dz - 1, dy - 1, dx - 1).
 """
 
 import itertools
@@ -15,19 +14,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..mechanics.hex8 import pad_axis
-from ..mechanics.staging import apart
+from ..mechanics.unfused import unfused
 
 Stencil = Float[Array, "3 9 3 3 mz my mx"]
 ElementMatrices = Float[Array, "nz 8 8 3 3 ny nx"]
 Nodal = Float[Array, "3 mz my mx"]
-# A stencil of one, two or three of the components, and a field that it multiplies.
+# A stencil of one, two or three components, and a field of as many.
 PartStencil = Float[Array, "3 9 c c mz my mx"]
 PartNodal = Float[Array, "c mz my mx"]
 
 
 def assemble_stencil(K: ElementMatrices) -> Stencil:
-    """Overlap element matrices into the stencil."""
-    return apart(_assembled, K)
+    """Assemble element matrices into the stencil."""
+    return unfused(_assembled, K)
 
 
 def _assembled(K: ElementMatrices) -> Stencil:
@@ -41,7 +40,7 @@ def _assembled(K: ElementMatrices) -> Stencil:
 
 
 def overlap(K: Array, a: int, b: int, cell: int) -> Array:
-    """Turn pairs of cell ends (a, b) along one axis into node offsets -1, 0, +1, placed first."""
+    """Convert pairs of cell ends (a, b) along one axis to node offsets -1, 0, +1, on the first axis."""
     pair = {(i, j): jnp.take(jnp.take(K, j, axis=b), i, axis=a) for i in (0, 1) for j in (0, 1)}
     if cell > 0:
         cell -= sum(axis < cell for axis in (a, b))
@@ -55,17 +54,17 @@ def overlap(K: Array, a: int, b: int, cell: int) -> Array:
 
 
 def apply_stencil(S: PartStencil, u: PartNodal) -> PartNodal:
-    """Multiply the assembled matrix with a nodal field.
+    """Compute the product of the assembled matrix with a nodal field.
 
-    Along one axis of all nodes a neighbour is a shift, whatever the direction, and loops are long. What a shift
-    brings from beyond a border meets a block of zeros.
+    On the flattened nodes every neighbour is a shift, and loops are long. Values shifted across a border meet a block
+    of zeros.
     """
     components, shape = len(u), u.shape[1:]
     nodes = int(np.prod(shape))
     furthest = shape[1] * shape[2] + shape[2] + 1
     padded = jnp.pad(u.reshape(components, nodes), ((0, 0), (furthest, furthest)))
-    # All pairs of components at once: row by row is four times as many instructions to compile.
-    pairs = apart(
+    # All pairs of components at once: row by row compiles four times as many instructions.
+    pairs = unfused(
         partial(_sum_over_neighbours, shape=shape), S.reshape(27, -1, nodes), jnp.tile(padded, (components, 1))
     )
     pairs = pairs.reshape(components, components, *shape)
@@ -80,7 +79,7 @@ def _sum_over_neighbours(blocks: Array, padded: Array, shape: tuple[int, ...]) -
 
 
 def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
-    """Put `scale` on the diagonal of rows that are zero: held and ghost unknowns."""
+    """Set the diagonal of zero rows, of fixed and ghost unknowns, to `scale`."""
     eye = np.eye(3, dtype=S.dtype)[:, :, None, None, None]
     centre = S[1, 4]
     diagonal = jnp.sum(eye * centre, axis=1, keepdims=True)
@@ -89,7 +88,7 @@ def with_unit_diagonal(S: Stencil, scale: Array) -> Stencil:
 
 
 def column_blocks(S: PartStencil) -> Float[Array, "m m my mx"]:
-    """Collect each column's own matrix, m = c (nz+1) unknowns ordered as a nodal field's, (component, z)."""
+    """Extract the diagonal block of each column: m = c (nz+1) unknowns in the order (component, z)."""
     components, nodes = S.shape[3:5]
     blocks = jnp.zeros((components, nodes, components, nodes, *S.shape[5:]), S.dtype)
     for dz in range(3):
@@ -99,7 +98,7 @@ def column_blocks(S: PartStencil) -> Float[Array, "m m my mx"]:
 
 
 def dense_matrix(S: Stencil) -> Float[Array, "n n"]:
-    """Write a small stencil out as a matrix of nodal fields."""
+    """Expand a small stencil to a dense matrix of nodal fields."""
     shape = S.shape[-3:]
     nodes = int(np.prod(shape))
     z, y, x = np.indices(shape).reshape(3, -1)
@@ -112,9 +111,9 @@ def dense_matrix(S: Stencil) -> Float[Array, "n n"]:
 
 
 def coarsen_stencil(S: Stencil, axis: int) -> Array:
-    """Keep every other node along one axis: Galerkin product with linear interpolation.
+    """Coarsen along one axis by two: Galerkin product with linear interpolation.
 
-    An even count of nodes gets a ghost beyond its end, whose row is zero but for what interpolation brings.
+    An even number of nodes is extended by a ghost node, whose row has interpolated entries only.
 
     Args:
         S: The stencil.
@@ -146,7 +145,7 @@ def _hat(offset: int) -> float:
 
 
 def neighbours(values: Float[Array, "c mz my mx"]) -> Float[Array, "3 9 c mz my mx"]:
-    """Collect what the 27 neighbours of every node have; zero beyond the border."""
+    """Gather the values of the 27 neighbours of every node; zero beyond the border."""
     around = jnp.pad(values, [(0, 0), (1, 1), (1, 1), (1, 1)])
     for axis in (-1, -2, -3):
         n = values.shape[axis]

@@ -1,4 +1,4 @@
-"""The tangent of the discrete problem: the linear operator of one Newton step, and its preconditioner's block.
+"""The tangent of the discrete problem: linear operator of one Newton step, and its block preconditioner.
 
 Displacement alone, or displacement and the elements' mean stress: a saddle point
 [[A, Bᵀ], [B, -M/bulk]], which stays well-posed when the bulk modulus is infinite.
@@ -18,24 +18,25 @@ from ..mechanics.kinematics import LayerCells
 from .multigrid import Multigrid, apply_multigrid
 from .stencil import Nodal, apply_stencil
 
-# Stiffness of volume in the preconditioner of `hybrid`, over the shear modulus: what multigrid is fast at.
+# Bulk over shear modulus in the preconditioner of `hybrid`: moderate, as multigrid iterations grow with its square
+# root.
 VOLUME_GUARD = 20.0
 
 
 class Unknowns(NamedTuple):
-    """What Newton's method solves for, and residuals of the same shape; in a stack, tuples over bodies.
+    """Unknowns of Newton's method, and residuals of the same structure; in a stack, tuples over bodies.
 
     Attributes:
         u: Displacement [mm]; as a residual, force [N].
-        mean_stress: Mean stress of the elements [MPa]; as a residual, the volume they miss [mm³]. None where
-            it is no unknown.
+        mean_stress: Mean stress of the elements [MPa]; as a residual, volume [mm³]. None where it is
+            no unknown.
     """
 
     u: PyTree
     mean_stress: PyTree = None
 
     def scaled(self, scale: Array) -> "Unknowns":
-        """Multiply mean stress by a scale: over a linear system's scale it is in mm, its residual in N."""
+        """Scale mean stress: divided by a linear system's scale it is in mm, its residual in N."""
         return self._replace(mean_stress=jax.tree.map(lambda stress: scale * stress, self.mean_stress))
 
 
@@ -44,12 +45,12 @@ class AbstractTangent(Protocol):
     """The linear operator of one Newton step, in float32."""
 
     def apply(self, x: Unknowns) -> Unknowns:
-        """Multiply with unknowns."""
+        """Compute the product with unknowns."""
         ...
 
 
 class VolumeCoupling(NamedTuple):
-    """How mean stress and displacement couple, both in mm (`Unknowns.scaled`).
+    """Coupling of mean stress and displacement, both in mm (`Unknowns.scaled`).
 
     Attributes:
         vectors: Derivative of each element's volume by its free nodes, times the scale [N/mm].
@@ -75,7 +76,7 @@ class VolumeCoupling(NamedTuple):
 
     @property
     def schur_inverse(self) -> Array:
-        """Invert what is left for the mean stress when displacement with the guard's stiffness is eliminated."""
+        """Apply the inverse of the approximate Schur complement for mean stress, displacement eliminated."""
         left = 1.0 - self.guard * self.compliance
         return 1.0 / (self.mass * (self.compliance + left / (self.guard + 2.0 * self.shear)))
 
@@ -83,13 +84,13 @@ class VolumeCoupling(NamedTuple):
 def couple_volume(
     body: LayerBody, free: np.ndarray, u: Nodal, scale: Array
 ) -> tuple[VolumeCoupling, Float[Array, "nz 8 8 3 3 ny nx"]]:
-    """Couple mean stress and displacement; and the stiffness of volume for the preconditioner [N/mm].
+    """Build the coupling of mean stress and displacement, and the volumetric stiffness of the preconditioner [N/mm].
 
     Args:
         body: The layer.
         free: Mask of the unknowns, 1 where free.
         u: Displacement [mm].
-        scale: Mean stress that weighs as much as a displacement of 1 mm [MPa/mm].
+        scale: Scale of mean stress over displacement [MPa/mm].
     """
     by_node = body.volume_vectors(u)
     volume = body.cells.volume[0]
@@ -110,17 +111,18 @@ def couple_volume(
 class Tangent(NamedTuple):
     """The linear operator of one Newton step, in float32, and its preconditioner.
 
-    The preconditioner is a V-cycle for a stiffness that is symmetric and positive where it matters, the guarded
-    one. Its finest stencil serves the operator too, which adds what the guarded stiffness lacks.
+    The preconditioner is a V-cycle for the guarded stiffness, which is symmetric and positive definite. The operator is
+    its finest stencil plus the terms that the guarded stiffness omits.
 
     Attributes:
-        multigrid: Of the guarded stiffness.
-        faces: What it lacks of contact, or all contact where it lacks the body: face matrices `(4, 4, 3, 3, faces)`.
-        diagonal: What it lacks of springs and drag at the nodes [N/mm]; broadcasts to a nodal field.
-        free: 1 where an unknown is free; None where all are.
+        multigrid: Preconditioner of the guarded stiffness.
+        faces: Omitted terms of contact, or all of contact where the body is omitted: face matrices
+            `(4, 4, 3, 3, faces)`.
+        diagonal: Omitted terms of springs and viscosity at the nodes [N/mm]; broadcasts to a nodal field.
+        free: 1 for free unknowns; None: all are free.
         cells: Cells of the layer.
         points: dP/dF times volume, where the stiffness is of other elements than the body.
-        volume: How mean stress and displacement couple, where mean stress is an unknown.
+        volume: Coupling of mean stress and displacement, where mean stress is an unknown.
     """
 
     multigrid: Multigrid
@@ -132,7 +134,7 @@ class Tangent(NamedTuple):
     volume: VolumeCoupling | None
 
     def apply(self, x: Unknowns) -> Unknowns:
-        """Multiply with unknowns."""
+        """Compute the product with unknowns."""
         u = x.u.astype(jnp.float32)
         inside = u if self.free is None else self.free * u
         more = self._of_faces(inside) + self.diagonal * inside
@@ -151,8 +153,8 @@ class Tangent(NamedTuple):
     def precondition(self, r: Unknowns) -> Unknowns:
         """Apply one V-cycle; with mean stress, a block-triangular step around it.
 
-        The displacement block carries the guard's stiffness of volume (an augmented Lagrangian), so that the
-        iterations do not grow with the bulk modulus.
+        The displacement block includes a volumetric stiffness (augmented Lagrangian), so that the number of iterations
+        does not grow with the bulk modulus.
 
         Source:
             Benzi, Golub & Liesen, Acta Numerica 14 (2005), sections 8 and 10.

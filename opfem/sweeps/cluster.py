@@ -1,6 +1,6 @@
 """`Cluster`: points of a sweep on the workers of a `dask.distributed` client that exists already.
 
-Workers compute, this process writes: they need no common disk. What a lost worker had begun goes to another.
+Workers compute, this process writes: they need no common disk. Another worker repeats the batches of a lost one.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ class Cluster:
             )
 
     def plan(self, begun: Plan | None) -> Plan:
-        """Settle how batches are computed; what is left open is as it was begun."""
+        """Choose how batches are computed; open choices are those of the begun sweep."""
         return settled(self.size, self.mode, 1, begun)
 
     def run(
@@ -60,7 +60,7 @@ class Cluster:
 
         content = cloudpickle.dumps((configuration(), cloudpickle.dumps((fn, outputs, plan))))
         token = hashlib.sha256(content).hexdigest()
-        # A task of its own, so that it is sent once, and made again where its worker is lost.
+        # A separate task, so that it is sent once, and repeated where its worker is lost.
         task = self.client.submit(bytes, content, key=f"opfem-sweep-{token}")
         running = {}
 

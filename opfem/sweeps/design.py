@@ -67,12 +67,12 @@ def grid(axes: Mapping[str, Any]) -> Points:
         axes: Values of each argument: a list, an array or a one-dimensional `xarray.DataArray`, whose units are kept.
 
     Raises:
-        ValueError: If an axis is empty, has more than one dimension, holds NaN, or repeats a value.
+        ValueError: If an axis is empty, has more than one dimension, contains NaN, or repeats a value.
     """
     values, units = _read(axes)
     for name, axis in values.items():
         if len(np.unique(axis)) < len(axis):
-            raise ValueError(f"Axis {name!r} of the sweep must hold each value once, got {_short(axis)}.")
+            raise ValueError(f"Axis {name!r} of the sweep must contain each value once, got {_short(axis)}.")
     mesh = np.meshgrid(*values.values(), indexing="ij")
     columns = {name: column.ravel() for name, column in zip(values, mesh, strict=True)}
     return Points(columns, values, units)
@@ -184,14 +184,14 @@ def _read_axis(name: str, axis: Any) -> np.ndarray:
     if values.ndim != 1:
         raise ValueError(
             f"Axis {name!r} of the sweep must be a list of numbers, got shape {values.shape}. A fixed value is a list "
-            "of one; for maps sweep an index, and look the map up in the function: maps[index]."
+            "of one; for maps sweep an index, and index the maps in the function: maps[index]."
         )
     if values.size == 0:
         raise ValueError(f"Axis {name!r} of the sweep is empty. Give it at least one value, or leave it out.")
     if values.dtype.kind not in "fiubU":
-        raise ValueError(f"Axis {name!r} of the sweep must hold numbers or words, got {_short(values)}.")
+        raise ValueError(f"Axis {name!r} of the sweep must contain numbers or words, got {_short(values)}.")
     if values.dtype.kind == "f" and np.isnan(values).any():
-        raise ValueError(f"Axis {name!r} of the sweep must not hold NaN, got {_short(values)}.")
+        raise ValueError(f"Axis {name!r} of the sweep must not contain NaN, got {_short(values)}.")
     return values.astype(float) if values.dtype.kind == "f" else values
 
 

@@ -33,7 +33,7 @@ class Program:
 
     Args:
         fn: The function of a sweep.
-        outputs: What to keep of its answers.
+        outputs: Outputs to store.
         plan: How batches are computed.
         example: Columns of any points, for their types.
     """
@@ -44,14 +44,14 @@ class Program:
         self._compiled = None if plan.mode == "call" else self._compile(_padded(example, plan.points))
 
     def outcomes(self, columns: Columns) -> list[Outcome]:
-        """Compute the points of a batch; what raises becomes an outcome."""
+        """Compute the points of a batch; an exception becomes an outcome."""
         count = len(next(iter(columns.values())))
         if self._compiled is None:
             points = [{name: column[i].item() for name, column in columns.items()} for i in range(count)]
             return [self._guarded(partial(self._called, point), 1)[0] for point in points]
         batch = self._guarded(partial(self._run, columns), count)
         if count > 1 and batch[0].status == ERROR:
-            # One point cannot tell which of a batch raised; alone, the others need not suffer.
+            # A batch does not identify the point that raised: repeat the points one by one.
             alone = [{name: column[i : i + 1] for name, column in columns.items()} for i in range(count)]
             return [self._guarded(partial(self._run, point), 1)[0] for point in alone]
         return batch
@@ -115,7 +115,7 @@ def _outcome(values: dict[str, np.ndarray], labels: dict[str, Label], seconds: f
 
 
 def _one_line(cause: Exception) -> str:
-    """Take the line of a message that says what is wrong: of an error inside compiled code, that of the inner one."""
+    """Return the line of a message that names the error: of an error inside compiled code, that of the inner one."""
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     inner = [line for line in lines if re.match(r"[\w.]+Error: ", line)]
     text = inner[-1] if inner else f"{type(cause).__name__}: {lines[0] if lines else 'no message'}"
@@ -128,9 +128,9 @@ class Batch:
 
     Args:
         size: Points that one call of the compiled program computes; None: 1, or 32 with "vmap".
-        mode: "map", "vmap", "call" (for what jit cannot trace, such as `fit_traction`) or "auto": "map" on a CPU, where
-            lanes that wait for the slowest cost as much as those that work, "vmap" on an accelerator, "call" where
-            tracing fails.
+        mode: "map", "vmap", "call" (for functions that jit cannot trace, such as `fit_traction`) or "auto": "map" on a
+            CPU, where lanes that wait for the slowest cost as much as those that work, "vmap" on an accelerator, "call"
+            where tracing fails.
         threads: Batches computed side by side; None: one for each core on a CPU, else one.
 
     Raises:
@@ -145,7 +145,7 @@ class Batch:
         check_settings(self, "Batch", ("size", "threads"))
 
     def plan(self, begun: Plan | None) -> Plan:
-        """Settle how batches are computed; what is left open is as it was begun."""
+        """Choose how batches are computed; open choices are those of the begun sweep."""
         return settled(self.size, self.mode, 1, begun)
 
     def run(self, program: Program, batches: Iterator[tuple[range, Columns]]):
@@ -176,7 +176,7 @@ class Devices:
             raise ValueError('Devices.mode must be "map", "vmap" or "auto", got "call", which runs on the host.')
 
     def plan(self, begun: Plan | None) -> Plan:
-        """Settle how batches are computed; what is left open is as it was begun."""
+        """Choose how batches are computed; open choices are those of the begun sweep."""
         return settled(self.size, self.mode, jax.local_device_count(), begun)
 
     def run(self, program: Program, batches: Iterator[tuple[range, Columns]]):

@@ -1,6 +1,6 @@
-"""What a function computes with, as a hash: its code, and everything that it captures.
+"""Hash of a function: of its code, and of everything that it captures.
 
-A sweep that is taken up again must not mix results of two functions. What cannot be hashed is refused.
+A resumed sweep must not mix results of two functions. Objects that cannot be hashed are refused.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ _LIBRARIES = frozenset(sys.stdlib_module_names) | {"opfem", "jax", "jaxlib", "eq
 
 
 def environment() -> dict[str, str]:
-    """Name what else decides the bits of a result: versions, precision and kind of device."""
+    """Return what else determines the bits of a result: versions, precision and kind of device."""
     return {
         **versions(),
         "jaxlib_version": version("jaxlib"),
@@ -41,7 +41,7 @@ def hash_of(what: str, part: Any) -> str:
     """Hash a function, an array, or anything made of those.
 
     Args:
-        what: What it is called in a message.
+        what: Its name in a message.
         part: Functions count by their code and by everything that they capture: closures, defaults and the globals
             that they name; functions of libraries by their name.
 
@@ -49,13 +49,13 @@ def hash_of(what: str, part: Any) -> str:
         SHA-256 in hexadecimal, the same in every process.
 
     Raises:
-        ValueError: If it holds something whose content is unknown, such as an open file or a random generator.
+        ValueError: If it contains an object of unknown content, such as an open file or a random generator.
     """
     return _Hashes().of(what, part).hex()
 
 
 class _Hashes:
-    """Hashes part by part; remembers what it has seen, for functions that call each other or are called often."""
+    """Hashes part by part, with a memo for functions that call each other or are called often."""
 
     def __init__(self):
         self.seen: dict[int, tuple[Any, bytes]] = {}
@@ -107,14 +107,14 @@ class _Hashes:
             yield f"library {_full_name(part)}".encode()
         else:
             raise ValueError(
-                f"{path} is a {type(part).__name__}, whose content op.sweep cannot hash: it could not tell a finished "
-                "point from one of another function. Capture arrays, numbers, opfem objects and plain functions, make "
-                "what else is needed inside the function, or sweep without out=."
+                f"{path} is a {type(part).__name__}, whose content op.sweep cannot hash: it could not distinguish a "
+                "finished point from one of another function. Capture arrays, numbers, opfem objects and plain "
+                "functions, create other objects inside the function, or sweep without out=."
             )
 
     def _function(self, path: str, fn: types.FunctionType) -> Iterator[bytes]:
         home = sys.modules.get(fn.__globals__.get("__name__", "__main__"))
-        if home is not None and _is_library(home):  # its version says what its code and its globals are
+        if home is not None and _is_library(home):  # its version determines its code and its globals
             yield f"library {home.__name__}.{fn.__code__.co_qualname}".encode()
             if hasattr(fn, "__wrapped__"):
                 yield self.of(path, fn.__wrapped__)
@@ -132,7 +132,7 @@ class _Hashes:
             yield self.of(name, content)
 
     def _code(self, path: str, code: types.CodeType) -> Iterator[bytes]:
-        """Yield what the code does; where it stands does not count."""
+        """Yield the parts of the code that determine its results, without its position."""
         yield code.co_code
         names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
         yield repr((names, code.co_argcount, code.co_kwonlyargcount, code.co_flags)).encode()
@@ -162,7 +162,7 @@ def _digest(pieces: Iterable[bytes]) -> bytes:
 
 
 def _simple(part: Any) -> list[bytes] | None:
-    """Return the bytes of what has no parts, else None."""
+    """Return the bytes of an object without parts, else None."""
     if isinstance(part, jax.Array) and jnp.issubdtype(part.dtype, jax.dtypes.prng_key):
         part = jax.random.key_data(part)
     if isinstance(part, jax.Array | np.ndarray | np.generic):
@@ -186,7 +186,7 @@ def _global_names(code: types.CodeType) -> set[str]:
 
 
 def _is_library(part: Any) -> bool:
-    """Tell whether something is named well enough by its name: it comes with Python, opfem or what opfem needs."""
+    """Return whether a name identifies a module: it comes with Python, opfem or a dependency of opfem."""
     module = part.__name__ if isinstance(part, types.ModuleType) else getattr(part, "__module__", None)
     if not isinstance(module, str) or module == "__main__":  # which may be a program that runs the user's code
         return False

@@ -1,6 +1,6 @@
-"""What a point of a sweep keeps: named arrays, how they are labelled, and how the point ended.
+"""Outputs of a point of a sweep: named and labelled arrays, and the status of the point.
 
-A solution is reduced to what is asked for before it leaves the compiled program.
+A solution is reduced to the requested fields inside the compiled program.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ ERROR, NONFINITE, SUCCESSFUL = "error", "nonfinite", "successful"
 GOOD = CONVERGED
 """Statuses of points that have a result."""
 _ENDS = {"solve": RESULTS, "fit": FitStatus}
-# Equinox offers no other way from a name to its item.
+# Equinox has no public mapping from names to items.
 _NAMES = {kind: enumeration._name_to_item for kind, enumeration in _ENDS.items()}
 _ELEMENTS = ("y_element", "x_element")
 FIELDS: dict[str, tuple[tuple[str, ...], str, str, Callable[[Any], Any]]] = {
@@ -57,7 +57,7 @@ class Sensitivities(NamedTuple):
     """A function's value and its derivatives.
 
     Attributes:
-        value: What the function returned: a number, an array, or a dict of these.
+        value: Result of the function: a number, an array, or a dict of these.
         derivatives: By argument: the same, differentiated by it.
     """
 
@@ -72,7 +72,7 @@ class Label:
     Attributes:
         dims: Its dimensions; None: unnamed.
         units: Its units; None: unknown.
-        long_name: What it is.
+        long_name: Description.
         per: Argument that it is differentiated by.
     """
 
@@ -83,17 +83,17 @@ class Label:
 
 
 class OutputError(ValueError):
-    """What the function of a sweep returns cannot be kept as asked, at any point."""
+    """The results of a sweep's function cannot be stored as requested, at any point."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outputs:
-    """Turns what a function returns into named arrays. Works inside jit; labels do not depend on numbers.
+    """Converts the results of a function to named arrays. Works inside jit; labels do not depend on numbers.
 
     Args:
         name: Name of an output that has none.
-        keep: What to keep of a solution, or a function that reduces what was returned to a dict of arrays.
-        units: Units of axes and of outputs that have none of their own.
+        keep: Fields of a solution to store, or a function that reduces a result to a dict of arrays.
+        units: Units of axes, and of outputs without a known unit.
         axes: Names of the axes.
     """
 
@@ -103,11 +103,11 @@ class Outputs:
     axes: tuple[str, ...]
 
     def arrays(self, returned: Any) -> tuple[dict[str, Array], dict[str, Label]]:
-        """Name the arrays in what a function returned, and label them.
+        """Name and label the arrays of a result.
 
         Raises:
-            OutputError: If it holds anything but numbers, arrays, solutions and dicts of them, or `keep` names
-                what is not there.
+            OutputError: If it contains anything but numbers, arrays, solutions and dicts of them, or `keep` names
+                an unknown field.
         """
         values, labels = {}, {}
         if callable(self.keep):
@@ -207,7 +207,7 @@ def _end_codes(part: _Solved | TractionFit) -> Array:
 
 
 def ending(values: dict[str, np.ndarray]) -> tuple[str, str]:
-    """Say how a point ended: a status and a message, empty when all is well.
+    """Return the status of a point and a message, empty if it succeeded.
 
     A number, or a map that has no finite number at all, is taken for a failure.
     """

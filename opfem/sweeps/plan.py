@@ -1,4 +1,4 @@
-"""How the batches of a sweep are computed: what decides the bits of a result besides its inputs."""
+"""Plan of the batches of a sweep, which determines the bits of a result besides its inputs."""
 
 import dataclasses
 from typing import Any, Literal, get_args
@@ -6,13 +6,13 @@ from typing import Any, Literal, get_args
 from .._device import choices
 
 Mode = Literal["auto", "map", "vmap", "call"]
-# Points per batch of `vmap` where the user says nothing.
+# Default number of points per batch of `vmap`.
 _VMAP_SIZE = 32
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How batches are computed: what decides the bits of a result besides the inputs.
+    """Plan of the batches, which determines the bits of a result besides the inputs.
 
     Attributes:
         mode: "map": one point after the other in one program; "vmap": together, until the slowest is done; "call":

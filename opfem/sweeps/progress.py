@@ -9,10 +9,10 @@ from .store import Outcome
 
 
 class SweepProgress:
-    """Counts the points of a sweep and says how far it is.
+    """Progress of a sweep.
 
     Args:
-        shown: Where to say so.
+        shown: Display of the progress.
         total: Points of the sweep.
         finished: Points that an earlier run has finished.
     """
@@ -40,7 +40,7 @@ class SweepProgress:
         self._shown.line(f"{reached} of {self._total} points: {place}: {ended}; {self.text()}")
 
     def text(self) -> str:
-        """Say rate, failures and time left; compilation counts as time of the first points."""
+        """Show rate, failures and remaining time; compilation is part of the time of the first points."""
         elapsed = max(time.perf_counter() - self._begin, 1e-9)
         rate = self._done / elapsed
         left = (self._total - self._finished - self._done) / rate if rate > 0 else float("inf")

@@ -22,7 +22,7 @@ def value_and_sensitivities(fn: Callable[..., Any]) -> Callable[..., Sensitiviti
         fn: Returns a number, an array, or a dict of these; its arguments are numbers.
 
     Raises:
-        ValueError: When called with what has no derivative, or when `fn` returns something else.
+        ValueError: For arguments without derivative, and for other results of `fn`.
 
     Example:
         >>> import opfem as op

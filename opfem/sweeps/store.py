@@ -1,6 +1,6 @@
-"""The folder of a resumable sweep: what is swept, and one whole file for every finished point.
+"""Folder of a resumable sweep: its inputs, and one complete file for every finished point.
 
-Files appear by renaming, whole or not at all, under names that say what they hold, so that any number of
+Files appear by renaming, whole or not at all, under names that identify their contents, so that any number of
 processes may work on one sweep.
 """
 
@@ -55,7 +55,7 @@ class Memory:
         """Do nothing: there is nothing to go on with."""
 
     def has(self, point: int) -> bool:
-        """Tell whether a point is finished."""
+        """Return whether a point is finished."""
         return point in self._outcomes
 
     def write(self, point: int, outcome: Outcome) -> None:
@@ -72,14 +72,14 @@ class Folder:
 
     Args:
         path: The folder.
-        inputs: What decides the numbers, hashed, by name.
+        inputs: Hashes of the inputs, by name.
         keys: Hash of each point: its values and all of `inputs`.
 
     Attributes:
         plan: How the sweep was begun; None: it was not.
 
     Raises:
-        ValueError: If the folder holds another sweep, or something else.
+        ValueError: If the folder contains another sweep, or other files.
     """
 
     def __init__(self, path: Path, inputs: dict[str, str], keys: list[str]):
@@ -110,13 +110,13 @@ class Folder:
         return plan
 
     def begin(self, plan: Plan) -> None:
-        """Write down what is swept, and how."""
+        """Write the inputs of the sweep and its plan."""
         self._points.mkdir(parents=True, exist_ok=True)
         record = {"inputs": self._inputs, "execution": dataclasses.asdict(plan)}
         write_whole(self._folder / PLAN, (json.dumps(record, indent=2) + "\n").encode())
 
     def has(self, point: int) -> bool:
-        """Tell whether a point is finished, by this process or another; a damaged file counts for nothing."""
+        """Return whether a point is finished, by this process or another; a damaged file is ignored."""
         if point not in self._finished and self._path(point).exists():
             try:
                 self.read(point)
@@ -141,7 +141,7 @@ class Folder:
         self._finished.add(point)
 
     def read(self, point: int) -> Outcome:
-        """Read a finished point; zip files carry checksums, which catches what the disk has damaged."""
+        """Read a finished point; zip files carry checksums, which detect damage."""
         with self._path(point).open("rb") as file, np.load(file, allow_pickle=False) as stored:
             record = json.loads(str(stored["record"]))
             if record.pop("key") != self._keys[point]:

@@ -1,6 +1,6 @@
 """`sweep`: a function at many points, as one labelled table.
 
-Sees the whole chain; what is swept is any function of numbers, and a solve is one.
+It sees the whole chain and sweeps any function of numbers, such as a solve.
 """
 
 import dataclasses
@@ -41,33 +41,33 @@ def sweep(
     out: str | os.PathLike | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
-    """Compute a function at many points; what fails is marked and stops no other.
+    """Compute a function at many points; a failed point is marked and stops no other.
 
-    `status` says how each point ended: "successful"; what `RESULTS` and `FitStatus` name; "nonfinite" where an output
+    `status` of each point: "successful"; what `RESULTS` and `FitStatus` name; "nonfinite" where an output
     has no finite number; "error" where the function raised, with its words in `message`. Failed points hold NaN.
     `wall_time` [s] of a point in a batch is its share of it. A `Solution` must come from `solve(..., throw=False)`.
 
     Args:
-        fn: Function of numbers, called with one argument for each axis; what is the same for all points it captures.
+        fn: Function of numbers, called with one argument for each axis; it captures constants.
             Returns a number, an array, a `Solution`, a `TractionFit`, or a dict of these.
         axes: Values of each argument: a grid of all combinations; or points from `zip_` or `sample`.
-        keep: What to keep of a solution: "max_pressure", "pressure", "traction", "slip", "contact_status",
+        keep: Fields of a solution to store: "max_pressure", "pressure", "traction", "slip", "contact_status",
             "displacement", "stress_zz", "thickness", of a fit also "pressure_std", "residual", "chi2",
             "effective_dof", and the names in `stats`; None: pressure and all of `stats`. Or a function that reduces
-            what `fn` returned to a dict of arrays.
-        units: Units of axes and of outputs that have none of their own.
+            the result of `fn` to a dict of arrays.
+        units: Units of axes, and of outputs without a known unit.
         execution: `Batch`, `Devices` or `Cluster`.
         out: Folder that keeps every finished point: a sweep that was interrupted goes on where it was when it is
             called again, and ends as if it had not been. The whole is `result.nc`, numbers are `table.csv`, too. None
             keeps nothing.
-        progress: Say how far it is, on a terminal, in a notebook or, where it takes long, on stderr.
+        progress: Show progress on a terminal, in a notebook or, where it takes long, on stderr.
 
     Returns:
         Outputs by axes, or by `point` where these form no grid.
 
     Raises:
         ValueError: For an axis that is empty or no argument of `fn`, units that contradict an output's own, an
-            `out` with different inputs, or a function that captures what cannot be hashed.
+            `out` with different inputs, or a function that captures objects that cannot be hashed.
         RuntimeError: If the function raised at every point.
 
     Example:
@@ -123,7 +123,7 @@ def _open(out: str | os.PathLike, fn: Callable, keep: Keep, points: Points) -> F
 
 
 def _prepare(fn: Callable, outputs: Outputs, execution: Execution, points: Points) -> tuple[Plan, Program | None]:
-    """Settle how batches are computed; where nothing else was asked for, what cannot be traced is called."""
+    """Choose how batches are computed; by default, functions that cannot be traced are called."""
     plan = execution.plan(None)
     example = _columns(points, range(1))
     called = Plan("call", 1)
@@ -156,7 +156,7 @@ def _run(
     store: Memory | Folder,
     shown: Progress,
 ) -> dict[int, Outcome]:
-    """Compute what is missing; return the points where the function raised, which are not kept."""
+    """Compute missing points; return those where the function raised, which are not stored."""
     batches = [range(i, min(i + plan.points, len(points))) for i in range(0, len(points), plan.points)]
     missing = [i for i in range(len(points)) if not store.has(i)]
     errors: dict[int, Outcome] = {}
@@ -165,7 +165,7 @@ def _run(
 
     def waiting() -> Iterator[tuple[range, Columns]]:
         for batch in batches:
-            # Asked again just before it begins: another process may have computed it.
+            # Checked again just before the start: another process may have computed it.
             if not all(store.has(i) for i in batch):
                 yield batch, _columns(points, batch)
 

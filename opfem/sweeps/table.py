@@ -19,7 +19,7 @@ def table(points: Points, read: Callable[[int], Outcome], attributes: dict[str, 
     Args:
         points: The points.
         read: Returns the outcome of each.
-        attributes: What else to say of the sweep.
+        attributes: Further attributes of the sweep.
     """
     columns, labels = _columns(len(points), read)
     status, message, seconds, *outputs = columns.items()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.observation import interface_heights
+from opfem.inverse.measured_surface import interface_heights
 
 
 def pressed_on(elements):

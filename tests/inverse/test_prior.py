@@ -54,15 +54,15 @@ def test_tikhonov_is_the_integral_of_the_squared_derivative(order):
     k = m * np.pi / width
     field = amplitude * np.cos(k * (0.25 * np.arange(SHAPE[1]) + 0.125)) * np.ones((SHAPE[0], 1))
     prior = op.Tikhonov(order, weight)
-    penalty = np.sum((prior.penalised(SHAPE) * prior.whiten(jnp.asarray(field), SPACING)) ** 2)
+    penalty = np.sum((prior.mode_weight(SHAPE) * prior.whiten(jnp.asarray(field), SPACING)) ** 2)
     area = width * SPACING[1] * SHAPE[0]
     assert penalty == pytest.approx(weight**2 * k ** (2 * order) * amplitude**2 / 2 * area, rel=1e-9)
 
 
 def test_tikhonov_hardly_holds_the_mean():
     prior = op.Tikhonov(1, 50.0)
-    flat = prior.penalised(SHAPE) * prior.whiten(jnp.full(SHAPE, 1e-3), SPACING)
-    tilted = prior.penalised(SHAPE) * prior.whiten(jnp.asarray(1e-3 * X / X.max()), SPACING)
+    flat = prior.mode_weight(SHAPE) * prior.whiten(jnp.full(SHAPE, 1e-3), SPACING)
+    tilted = prior.mode_weight(SHAPE) * prior.whiten(jnp.asarray(1e-3 * X / X.max()), SPACING)
     assert jnp.sum(flat**2) < 1e-5 * jnp.sum(tilted**2)
 
 
@@ -97,7 +97,7 @@ def test_total_variation_is_quadratic_where_smooth_and_counts_the_height_of_an_e
 
     def energy(field):
         white = prior.whiten(jnp.asarray(field), SPACING)
-        return 0.5 * sum(float(jnp.sum(part**2)) for part in prior.held(white, SPACING))
+        return 0.5 * sum(float(jnp.sum(part**2)) for part in prior.residual(white, SPACING))
 
     width, height = SPACING[0] * (SHAPE[1] - 1), SPACING[1] * (SHAPE[0] - 1)
     gentle = 0.02 * slope
@@ -115,5 +115,21 @@ def test_total_variation_sees_a_checkerboard():
     prior = op.TotalVariation(30.0, 2e-3)
     rows, columns = np.indices(SHAPE)
     field = 1e-4 * (-1.0) ** (rows + columns)
-    slopes, _ = prior.held(prior.whiten(jnp.asarray(field), SPACING), SPACING)
+    slopes, _ = prior.residual(prior.whiten(jnp.asarray(field), SPACING), SPACING)
     assert jnp.min(jnp.sum(slopes**2, axis=(0, 1))) > 0
+
+
+@pytest.mark.parametrize("prior", [op.Matern(0.7, 2e-3), op.Tikhonov(1, 300.0), op.TotalVariation(30.0, 2e-3)])
+def test_log_normaliser_is_half_the_log_determinant_of_the_covariance(prior):
+    shape, spacing = (5, 6), (0.2, 0.3)
+    root = jax.vmap(lambda white: prior.expand(white, spacing).ravel())(jnp.eye(30).reshape(30, *shape))
+    sign, log_determinant = np.linalg.slogdet(np.asarray(root.T @ root))
+    assert sign > 0
+    assert prior.log_normaliser(shape, spacing) == pytest.approx(0.5 * log_determinant, rel=1e-10)
+
+
+def test_length_below_an_element_is_refused():
+    with pytest.raises(ValueError, match=r"Matern.length \[mm\] must be at least an element, 0.3, got 0.25"):
+        op.Matern(0.25, 2e-3).check_resolved((0.2, 0.3))
+    op.Matern(0.35, 2e-3).check_resolved((0.2, 0.3))
+    op.Tikhonov(1, 300.0).check_resolved((0.2, 0.3))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem.inverse.transfer import poisson_ratio, transfer_function, wave_numbers
+from opfem.inverse.linear_layer import poisson_ratio, transfer_function
+from opfem.inverse.prior import wave_numbers
 
 # μG/h over x = k h, for Poisson's ratios 0.3, 0.45, 0.475, 0.49, 0.499, 0.5 (docs/validation.md, table B, bonded).
 RATIOS = (0.3, 0.45, 0.475, 0.49, 0.499, 0.5)

@@ -377,7 +377,7 @@ class TestWriting:
 
     def test_grid_is_not_passed_again(self, tmp_path, values):
         write_thickness(ThicknessMap(values, extent=EXTENT), tmp_path / "a.npz")
-        with pytest.raises(MeasurementError, match="knows its own grid; leave out extent"):
+        with pytest.raises(MeasurementError, match="contains its grid; leave out extent"):
             read_thickness(tmp_path / "a.npz", extent=EXTENT)
 
     def test_refuses_other_suffix(self, tmp_path, values):

@@ -7,8 +7,8 @@ import pytest
 import opfem as op
 from opfem.mechanics.boundary import Bodies, Touching, add_matrices, is_side, put, take, to_touching
 from opfem.mechanics.contact_body import RigidSurface
+from opfem.mechanics.contact_face import ContactFace
 from opfem.mechanics.face import area_vector, gather_face, surface_tangents
-from opfem.mechanics.interaction import ContactFace
 from tests.oracles import assemble_dense
 from tests.tolerances import ROUNDOFF
 

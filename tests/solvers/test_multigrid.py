@@ -15,12 +15,12 @@ from opfem.solvers.krylov import fgmres
 from opfem.solvers.multigrid import (
     _coarsen_mask,
     _coarsened_axes,
+    _enriched,
     _invert,
     _invert_columns,
-    _lean,
-    _leaning,
     _prolong,
     _restrict,
+    _sliding_rise,
     apply_multigrid,
     build_multigrid,
 )
@@ -118,7 +118,7 @@ def test_coarse_level_is_the_galerkin_product_of_free_unknowns():
     free = bottom_and_side_held(elements)
     multigrid = eqx.filter_jit(lambda E: build_multigrid(E, free, jnp.asarray(1e-3)))(jnp.array(K))
     built = multigrid.levels[1].stencil
-    P = leaning_matrix(np.asarray(multigrid.lean, float)) @ interpolation(elements)
+    P = leaning_matrix(np.asarray(multigrid.sliding_rise, float)) @ interpolation(elements)
     coarse_free = _coarsen_mask(free).ravel()
     fine = free.ravel()[:, None] * assemble_dense(K) * free.ravel()
     expected = coarse_free[:, None] * (P.T @ fine @ P) * coarse_free
@@ -166,7 +166,7 @@ def test_leaning_turns_heights_into_what_exceeds_the_lean(elements):
     lean = np.random.default_rng(4).standard_normal((2, *shape))
     K = element_matrices(elements)
     expected = leaning_matrix(lean).T @ assemble_dense(K) @ leaning_matrix(lean)
-    leaning = _leaning(assemble_stencil(jnp.array(K)), jnp.array(lean))
+    leaning = _enriched(assemble_stencil(jnp.array(K)), jnp.array(lean))
     columns = jnp.eye(3 * lean[0].size).reshape(-1, 3, *lean.shape[1:])
     found = np.asarray(jax.vmap(lambda u: apply_stencil(leaning, u))(columns)).reshape(len(columns), -1).T
     np.testing.assert_allclose(found, expected, atol=100 * ROUNDOFF * np.abs(expected).max())
@@ -271,7 +271,7 @@ def test_heights_that_follow_lateral_motion_need_little_energy():
     K = on_an_uneven_sample(elements)
     dense, n = assemble_dense(K), int(np.prod(node_shape(elements)))
     zz, zx = dense[2 * n :, 2 * n :], dense[2 * n :, :n]
-    lean = np.asarray(_lean(assemble_stencil(jnp.array(K))))[0].ravel()
+    lean = np.asarray(_sliding_rise(assemble_stencil(jnp.array(K))))[0].ravel()
     left = zx.sum(axis=1) + zz @ lean
     assert np.linalg.norm(left) < 0.2 * np.linalg.norm(zx.sum(axis=1))
 

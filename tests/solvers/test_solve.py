@@ -135,15 +135,18 @@ def test_cut_back_restores_the_state_and_equals_asking_for_the_smaller_increment
     settings = op.Newton().as_leaves()
     problem, start = prepare(published_palpation(), op.Imprint(bumpy_map()), None, settings, None, False)
     first = compiled_attempt(problem, start, settings)
-    whole = first._replace(increment=jnp.asarray(0.25, float))
-    failed = compiled_attempt(problem, whole, op.Newton(max_steps=1).as_leaves())
-    assert int(failed.increments) == int(first.increments)
-    assert int(failed.attempts) == int(first.attempts) + 1
+
+    def with_increment(size):
+        return first._replace(increments=first.increments._replace(size=jnp.asarray(size, float)))
+
+    failed = compiled_attempt(problem, with_increment(0.25), op.Newton(max_steps=1).as_leaves())
+    assert int(failed.increments.accepted) == int(first.increments.accepted)
+    assert int(failed.increments.attempts) == int(first.increments.attempts) + 1
     for kept, before in zip(jax.tree.leaves(failed.state), jax.tree.leaves(first.state), strict=True):
         assert np.array_equal(kept, before)
-    assert float(failed.increment) == 0.125
+    assert float(failed.increments.size) == 0.125
     after_cut = compiled_attempt(problem, failed, settings)
-    asked = compiled_attempt(problem, first._replace(increment=jnp.asarray(0.125, float)), settings)
+    asked = compiled_attempt(problem, with_increment(0.125), settings)
     np.testing.assert_array_equal(after_cut.state.u, asked.state.u)
     np.testing.assert_array_equal(after_cut.state.histories.window.elastic, asked.state.histories.window.elastic)
 
@@ -156,17 +159,17 @@ def test_a_snap_ends_in_equilibrium_and_no_state_on_its_way_is_accepted():
     window = op.Contact(op.HardOverclosure(exact=False), 0.0)
     problem, start = prepare(published_palpation(window, 0.0), op.Imprint(bumpy_map()), None, settings, None, False)
     direct = compiled_attempt(problem, start, settings)
-    snap = start._replace(viscosity=jnp.asarray(1.5, float))
+    snap = start._replace(snap=start.snap._replace(viscosity=jnp.asarray(1.5, float)))
     on_the_way = 0
-    while not int(snap.increments):
+    while not int(snap.increments.accepted):
         snap = compiled_attempt(problem, snap, settings)
-        if not int(snap.increments):
+        if not int(snap.increments.accepted):
             on_the_way += 1
             assert float(snap.state.fraction) == 0.0
             assert float(snap.origin.fraction) == 0.25
             np.testing.assert_array_equal(snap.state.u, start.state.u)
     assert 1 < on_the_way < 40
-    assert float(snap.viscosity) == 0.0
+    assert float(snap.snap.viscosity) == 0.0
     assert float(snap.residual) <= 1e-8
     np.testing.assert_allclose(snap.state.u, direct.state.u, atol=SOLVER)
 

@@ -44,9 +44,9 @@ def test_a_sample_is_stretched_over_its_bounds():
         ({"a": []}, "Axis 'a' of the sweep is empty"),
         ({"a": 1.0}, r"Axis 'a' of the sweep must be a list of numbers, got shape \(\)"),
         ({"a": np.zeros((2, 3))}, r"got shape \(2, 3\).*sweep an index"),
-        ({"a": [1.0, np.nan]}, "must not hold NaN"),
-        ({"a": [1.0, 1.0]}, "must hold each value once"),
-        ({"a": [object()]}, "must hold numbers or words"),
+        ({"a": [1.0, np.nan]}, "must not contain NaN"),
+        ({"a": [1.0, 1.0]}, "must contain each value once"),
+        ({"a": [object()]}, "must contain numbers or words"),
         ({"status": [1.0]}, "cannot be called 'status'"),
     ],
 )

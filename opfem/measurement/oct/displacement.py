@@ -48,7 +48,7 @@ class DisplacementVolume(AbstractGrid):
         scale_std: Relative standard deviation of the scale λ/n, common to all values [-].
         noise_length: FWHM of the lateral average along x and y [mm].
         axial_noise: Samples along depth that share one sample's noise [-].
-        steps: What was done, in order.
+        steps: Processing steps, in order.
     """
 
     values: Volume

@@ -20,11 +20,11 @@ MODELS = ("step", "peak", "step and peak")
 # Width of the model over the true one in each step of the fit: a wide model finds an edge some widths away. Speckle
 # is correlated along depth, and in the last steps the weight of two samples `lag` apart allows for it: the inverse of
 # the correlation, cut off after one lag. It lowers the std by 15 % at 15 dB and by 17 % at 3 dB of contrast; the whole
-# inverse would lower it by 5 % more, and amplify what the model misses.
+# inverse would lower it by 5 % more, and amplify the model error.
 _STEPS = ((2.5, 0.0), (1.7, 0.0), (1.3, 0.0), (1.0, 0.45), (1.0, 0.45), (1.0, 0.45))
 _COUPLING = _STEPS[-1][1]
 _LONGEST_STEP = 1.5  # widths that a step of the fit moves an edge by at most
-_SCATTER = 0.1  # of an averaged profile of speckle, which what the model misses is weighed against
+_SCATTER = 0.1  # of an averaged profile of speckle, relative to the model error
 _LEAST = 1e-6  # of the mean power of a profile, which every level of a model keeps above
 
 
@@ -225,7 +225,7 @@ def _solved(matrix, right):
     """Solve the small systems of all profiles by elimination; also the last pivot, the information on the place."""
     size = len(right)
     rows = [[matrix[max(i, j), min(i, j)] for j in range(size)] for i in range(size)]
-    # A level that the data do not tell stays as it is.
+    # A level that the data do not identify keeps its value.
     for i in range(size):
         rows[i][i] = rows[i][i] * jnp.float32(1.0 + 1e-5) + jnp.float32(1e-12)
     values = list(right)

@@ -22,7 +22,7 @@ from .volume import OctVolume
 
 Edge = Literal["auto", "brighter", "darker", "peak"]
 
-_WINDOW_REACH = 0.03  # mm below the window's interface where the sample's is looked for from
+_WINDOW_REACH = 0.03  # mm below the window's interface at which the search for the sample's starts
 
 
 class Interface(AbstractGrid):
@@ -33,13 +33,13 @@ class Interface(AbstractGrid):
         std: Its standard deviation [mm].
         confidence: Posterior probability of this depth against the best other one.
         contrast_db: Power below over power above [dB]; of a peak, over its ground.
-        edge: Index in `EDGES` of what was found.
+        edge: Index in `EDGES` of the kind of edge.
         mask: True where there is no interface to be sure of.
         spacing: (dx, dy) [mm].
         origin: (x, y) of the first pixel [mm].
         noise_length: FWHM [mm] of the Gaussian that correlates the noise.
         index: Group index that made depth geometric [-].
-        steps: What was done to the volume, and here.
+        steps: Processing steps of the volume and of this search.
     """
 
     depth: Map
@@ -84,7 +84,7 @@ class Interface(AbstractGrid):
         values = factor * (self.depth - edge_depth)
         usable = ~mask & (values > 0)
         if not usable.any():
-            raise MeasurementError("No pixel has an interface below the window; look at the B-scans.")
+            raise MeasurementError("No pixel has an interface below the window; inspect the B-scans.")
         placeholder = jnp.median(values[usable])
         step = Step("thickness", masked_pixels=(~usable).sum(), tilt_factor=factor)
         return ThicknessMap(
@@ -122,11 +122,11 @@ def find_interface(
         edge: The sample is "brighter" or "darker" than the layer, or the interface a reflecting "peak"; "auto" chooses
             by likelihood, in every neighbourhood.
         search: (from, to) geometric depth [mm]; `from` may be a map, `to` None is the volume's end. The first 20 to
-            30 µm hold what is left of the reference light.
+            30 µm contain residual reference light.
         max_slope: Largest slope of the interface [-].
         average: FWHM of the lateral average [mm]; half an element or less.
         background: Volume without a layer, whose mean depth profile is subtracted in place of artefact lines.
-        mask: Bool (ny, nx); True where A-lines hold no data.
+        mask: Bool (ny, nx); True where A-lines have no data.
         confidence: Pixels of less are masked.
         block_rows: B-scans that are worked on at once.
 
@@ -208,7 +208,7 @@ def _refuse(found: Found, doubtful, ignored, weak, confidence: float) -> None:
     if weak[used].mean() > 0.5:
         raise MeasurementError(
             f"No interface: the contrast is below {CONTRAST:g} dB over {weak[used].mean():.0%} of the map (median "
-            f"{np.median(np.abs(found.contrast[used])):.2g} dB, noise at {found.noise_db:.0f} dB). Look at the "
+            f"{np.median(np.abs(found.contrast[used])):.2g} dB, noise at {found.noise_db:.0f} dB). Inspect the "
             "B-scans; pass edge= one of brighter, darker, peak, or another search=."
         )
     if found.at_bound[used].mean() > 0.05:
@@ -219,7 +219,7 @@ def _refuse(found: Found, doubtful, ignored, weak, confidence: float) -> None:
     if doubtful[used].all():
         raise MeasurementError(
             f"No pixel has an interface of confidence {confidence:g} or more (median "
-            f"{np.median(found.confidence[used]):.2g}); look at the B-scans, or lower confidence=."
+            f"{np.median(found.confidence[used]):.2g}); inspect the B-scans, or lower confidence=."
         )
 
 

@@ -1,6 +1,6 @@
-"""What the camera of a spectrometer would count of a simulated field: interferograms on pixels even in wavelength.
+"""Counts of a spectrometer's camera for a simulated field: interferograms on pixels even in wavelength.
 
-Last step of `simulate_oct(spectra=True)`; `Spectra.to_volume` is the way back.
+Last step of `simulate_oct(spectra=True)`; `Spectra.to_volume` is the inverse.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Artefact lines at constant depth: autocorrelation, outer faces of the window, a camera's fixed pattern.
 
 First step of `find_interface`. Lines are what a grey opening removes of the median depth profiles of a map's tiles,
-at one depth in all of them: an interface is flat to a micrometre hardly ever. The mean B-scan is
+at one depth in all of them: an interface is rarely flat to a micrometre. The mean B-scan is
 never subtracted: over a flat layer the interface itself is constant in depth, and would go with it.
 """
 

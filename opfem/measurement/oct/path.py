@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates, median_filter
 
 _STRONGEST = 6.0  # standard deviations of the gradient: a bright speck counts no more than a clear edge
-# Per cell of depth that neighbours differ by: of a surface as it is, and of what is left along a first surface. Steep
+# Per cell of depth that neighbours differ by: of a surface itself, and of its residual along a first surface. Steep
 # surfaces of 3 dB are lost at 0.3 (standard deviation of the error 6.0 µm, 4.6 at 0.1), noise is followed below.
 _PENALTIES = (0.1, 0.3)
 _ROUNDS = 2  # of averaging along the surface found before: a third changes nothing at 3 dB
@@ -90,7 +90,7 @@ def coarse_path(
         edge: What to filter by.
         sign: 1 where power rises with depth, or at a peak; -1 where it falls.
         slopes: Largest difference between neighbouring cells along y and x [cells].
-        reach: Distance from the first surface that the others are looked for within [cells].
+        reach: Largest distance of the other surfaces from the first [cells].
         outside: Cells that are not searched.
     """
     gradient = _gradient(decibels.copy(), edge)

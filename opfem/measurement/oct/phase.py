@@ -1,7 +1,7 @@
 """Axial displacement from the phase of two complex volumes, to nanometres.
 
 Products of the two volumes are averaged laterally, as complex numbers, before anything else: the phase is then
-unwrapped from the window, where nothing moves, and the second volume carried back by what was found, so that neither
+unwrapped from the window, where nothing moves, and the second volume shifted back by the result, so that neither
 decorrelation nor the midpoint of the motion leaves an error.
 """
 
@@ -31,11 +31,11 @@ _KEPT = 0.5  # coherence above which a pass takes the displacement itself, not t
 _LOST = 0.3  # median coherence below which two volumes have nothing in common
 _REGISTERED = 0.05  # samples of lateral shift that are left alone
 _NOISE_BAND = 0.4  # cycles a sample; a point of 3 samples' FWHM has less than 1e-6 of its power beyond
-_TAPS = 8  # of the windowed sinc that carries the second volume back
+_TAPS = 8  # of the windowed sinc that shifts the second volume back
 _KAISER = 6.0  # of its window: 3e-4 of a field whose point spread function is 3 samples wide
 _NEIGHBOURS = 5  # A-lines along each side whose median a line is compared with
 _SLAB = 30_000_000  # samples of a slab of rows at once, at about ten complex64 arrays: 2.4 GB
-_BULK = 0.1  # mm below the window that tell the phase common to a B-scan
+_BULK = 0.1  # mm below the window that determine the common phase of a B-scan
 
 
 class _Plan(NamedTuple):
@@ -74,7 +74,7 @@ def axial_displacement(
             a phase common to each B-scan; or the `Interface` of the window, whose phase is removed in each A-line.
         average: FWHM of the lateral average along x and y [mm].
         interface: Depth of the sample's surface, an `Interface` or a map [mm]: below, nothing is given.
-        motion_compensation: Whether to carry the second volume back by what was found, and repeat.
+        motion_compensation: Whether to shift the second volume back by the result, and repeat.
         register: Whether to remove a lateral shift of each B-scan.
         phase_sign: +1 where the phase grows as a scatterer moves away from the window, -1 where it falls; None takes
             that of the volumes.
@@ -160,7 +160,7 @@ def _checked(before: OctVolume, after: OctVolume, phase_sign: int | None) -> int
     if signs not in ({1}, {-1}):
         raise MeasurementError(
             "axial_displacement: phase_sign must be 1 or -1, and one for both volumes, got "
-            f"{sorted(map(str, signs))}; press on the window: the phase of what recedes grows (1) or falls (-1)."
+            f"{sorted(map(str, signs))}; press on the window: for a receding sample the phase grows (1) or falls (-1)."
         )
     return int(next(iter(signs)) or 1)
 
@@ -188,7 +188,7 @@ def _followed(a: np.ndarray, b: np.ndarray, plan: _Plan) -> tuple[np.ndarray, np
         for axis in (0, 1):
             if plan.stds[axis] >= _NARROWEST:
                 guess = gaussian_filter1d(guess, plan.stds[axis], axis=axis, mode="nearest")
-        moved = _carried(b, guess)
+        moved = _shifted_back(b, guess)
         back = moved * a.conj() * np.exp(np.complex64(-1j * plan.radians) * guess)
         product = _averaged(back, plan)
         coherence = np.abs(product) / np.sqrt(np.maximum(power_a * _averaged(np.abs(moved) ** 2, plan), 1e-30))
@@ -243,7 +243,7 @@ def _smooth_line(slope: np.ndarray, count: int) -> np.ndarray:
     return (slope[..., None] * z).astype(np.float32)
 
 
-def _carried(b: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _shifted_back(b: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Interpolate b at z + u [samples] by a windowed sinc."""
     nz = b.shape[2]
     place = np.arange(nz, dtype=np.float32) + u
@@ -309,7 +309,7 @@ def _shifted(b: np.ndarray, shifts: np.ndarray) -> np.ndarray:
 
 
 def _consistent(u: np.ndarray, wrap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Take out whole turns by which a line differs from its neighbours; tell where it still differs."""
+    """Remove whole turns by which a line differs from its neighbours; return where it still differs."""
     size = (min(_NEIGHBOURS, u.shape[0]), min(_NEIGHBOURS, u.shape[1]), 1)
     if size[0] * size[1] == 1:
         return u, np.ones(u.shape, bool)

@@ -21,7 +21,7 @@ from .system import OctSystem
 from .volume import OctVolume, power
 
 _HALF_WINDOW = 0.06  # mm above and below the edge that levels are fitted to
-_REACH = 0.02  # mm that the edge is looked for away from the coarse surface
+_REACH = 0.02  # mm around the coarse surface that the search for the edge covers
 _TRUNCATE = 3.5  # standard deviations that the lateral average reaches
 _SHADE = 0.1  # of the power of its region, which an A-line in a shadow has less of
 _NEAREST, _REGION = 0.35, 8.0  # widths of the lateral average that an A-line's power and its region's are taken over
@@ -60,14 +60,14 @@ class Geometry(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """What the fine stage found, by pixels.
+    """Result of the fine stage, by pixel.
 
     Attributes:
         depth: Geometric depth from the volume's first sample [mm].
         std: Its standard deviation [mm].
         contrast: Power below over power above, or of a peak over its ground [dB].
         model: Index in `MODELS`.
-        shaded: A-lines that hold too little power of their own; they count for nothing.
+        shaded: A-lines of too little power; they are ignored.
     """
 
     depth: Float[np.ndarray, "ny nx"]

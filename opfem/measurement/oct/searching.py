@@ -37,7 +37,7 @@ _CLIPPED = 0.01  # share of samples at the lowest value from which a volume in d
 
 
 class Search(NamedTuple):
-    """What to look for; see `find_interface`."""
+    """Settings of the search; see `find_interface`."""
 
     edge: str
     search: tuple[Any, float | None]
@@ -49,7 +49,7 @@ class Search(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What was found at every pixel; lengths in mm."""
+    """Result at every pixel; lengths in mm."""
 
     depth: Float[np.ndarray, "ny nx"]
     std: Float[np.ndarray, "ny nx"]
@@ -65,7 +65,7 @@ class Found(NamedTuple):
 
 
 def search_volume(volume: OctVolume, system: OctSystem, options: Search) -> tuple[Found, tuple[Step, ...]]:
-    """Find the interface at every pixel, and say how."""
+    """Find the interface at every pixel."""
     geometry = geometry_of(volume, system, options.average)
     lowest, levels = _depths(volume, geometry, options.search)
     rows, columns = profile_lattice(volume.shape)
@@ -143,7 +143,7 @@ def _clipped_share(some, scale: str) -> float:
 
 
 def _cells(shape, geometry: Geometry, levels: slice) -> Cells:
-    """Cells some widths of the lateral average wide, larger where memory asks for it."""
+    """Cells some widths of the lateral average wide, larger where memory is short."""
     rows, columns = (max(1, int(width)) for width in geometry.average)
     depth = max(1, int(0.5 * FWHM_PER_STD * geometry.axial))
     while (shape[0] / rows) * (shape[1] / columns) * (levels.stop - levels.start) / depth > _MOST_CELLS:

@@ -90,9 +90,9 @@ def simulate_oct(
         snr: Power of the sample at its surface (mean depth) over the noise [dB].
         specular: Power of the surface's own reflection over the sample's, where it is level [dB]; None has none.
         lines: (depth [mm], power over the sample's [dB]) of artefact lines at constant depth.
-        scale: What a single volume holds.
-        spectra: Return what the camera of the spectrometer counts, with shot noise, in place of the volume. Shaped by
-            a Hann window, volumes of such spectra have 2 dB more noise than asked for.
+        scale: Scale of the samples of a single volume.
+        spectra: Return the counts of the spectrometer's camera, with shot noise, in place of the volume. Shaped by
+            a Hann window, volumes of such spectra have 2 dB more noise than given.
         dispersion: Second and third order of the phase [rad] of spectra at their ends.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Raw spectra of a spectral-domain microscope, and the complex volume they hold.
+"""Raw spectra of a spectral-domain microscope, and their conversion to a complex volume.
 
 One step before the volume: each A-line is an interferogram over the pixels of a spectrometer, which are not evenly
 spaced in wavenumber. Reference, resampling, dispersion, window and Fourier transform make a volume of it.
@@ -22,7 +22,7 @@ from .volume import OctVolume
 
 Window = Literal["hann", "none"]
 
-_LEAST_REFERENCE = 0.02  # of the brightest pixel of the reference: darker ones hold noise, and are not divided by
+_LEAST_REFERENCE = 0.02  # of the brightest pixel of the reference: darker ones are noise, and no divisor
 _ROWS = 8  # B-scans that are transformed at once
 
 
@@ -41,7 +41,7 @@ class Spectra(AbstractGrid):
         dispersion: Second and third order of the phase [rad] that the microscope adds at the ends of the spectrum.
         is_ascending: Whether wavenumber grows along the chirp's grid; static.
         repeats: How many B-scans and A-lines follow one another at each place; static.
-        steps: What was done before.
+        steps: Previous processing steps.
     """
 
     values: Shaped[np.ndarray | Array, "ny nx n"]
@@ -87,7 +87,7 @@ class Spectra(AbstractGrid):
             dispersion: Second and third order of the phase [rad] at the ends of the spectrum.
             is_ascending: Whether wavenumber grows along the pixels.
             repeats: How many B-scans and A-lines follow one another at each place.
-            steps: What was done before.
+            steps: Previous processing steps.
 
         Raises:
             ValueError: For a wrong shape, a chirp that is not monotone, a dark reference, repeats that do not divide.
@@ -140,7 +140,7 @@ class Spectra(AbstractGrid):
         """Transform to a complex volume; where A-lines repeat, to their mean power, whose phases have drifted.
 
         Args:
-            window: What the spectrum is shaped by where there is light: "hann", or "none", which keeps the reference's.
+            window: Apodisation of the spectrum where there is light: "hann", or "none", which keeps the reference's.
             dispersion: Second and third order of the phase [rad] at the ends of the spectrum, to be taken out; None
                 takes the stated ones.
 

@@ -1,4 +1,4 @@
-"""What the microscope does to a point: resolution, wavelength, and the layer's refractive index.
+"""OCT system: resolution, wavelength, and the layer's refractive index.
 
 The one place where optical lengths become geometric: depth in the layer = optical depth / `index`.
 """
@@ -18,7 +18,7 @@ _WAVELENGTHS = (3e-4, 2e-3)  # mm: ultraviolet to infrared
 
 
 class OctSystem(eqx.Module):
-    """An OCT microscope that looks into a layer.
+    """An OCT microscope that images a layer.
 
     In a common-path microscope the window–layer interface is the zero delay, and the thickness is the depth of the
     next interface. An error of 0.01 in `index` scales every thickness by 0.7 %; a strain of two thicknesses from

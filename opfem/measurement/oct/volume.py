@@ -1,4 +1,4 @@
-"""An OCT volume as the microscope's files hold it: samples `[y, x, z]`, their scale, spacing and history.
+"""An OCT volume as in the microscope's files: samples `[y, x, z]`, their scale, spacing and history.
 
 First link of the chain from the microscope: readers make it, `find_interface` takes it. Depth is stored optical, as in
 air, because a file cannot know the layer's index; `OctSystem` turns it geometric.
@@ -38,7 +38,7 @@ class OctVolume(AbstractGrid):
         scale: "db" (10 log10 of power), "linear" (power) or "complex" (field); static.
         phase_sign: +1 where the phase grows as a scatterer moves away from the window, -1 where it falls, None where
             that is not known; static.
-        steps: What was done to the volume so far, in order.
+        steps: Processing steps of the volume, in order.
 
     Example:
         >>> import numpy as np
@@ -82,7 +82,7 @@ class OctVolume(AbstractGrid):
             depth_origin: Optical depth of the first sample [mm].
             wavelength: Central wavelength in vacuum [mm].
             phase_sign: +1, -1 or None.
-            steps: What was done before.
+            steps: Previous processing steps.
 
         Raises:
             ValueError: For a wrong shape, type or scale, and a spacing that is not in mm.
@@ -153,7 +153,7 @@ class OctVolume(AbstractGrid):
         )
 
     def release(self) -> None:
-        """Drop the pages of a volume in a file from memory; they are read again when they are asked for."""
+        """Drop the pages of a volume in a file from memory; they are read again on access."""
         mapped = getattr(self.values, "_mmap", None)
         if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
             mapped.madvise(mmap.MADV_DONTNEED)
