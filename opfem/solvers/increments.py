@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from .newton import Newton
 
 # Gap of hard contact after an increment at full load, over that before, up to which another one follows. Two lifted
-# corners on 100×100×6 elements (`benchmarks/tissue.py lifted`) leave 2.2 µm of penetration at 0.5 and 0.05 µm at 0.9, in
-# 112 and 149 Newton steps: each increment leaves about 0.6 of the gap.
+# corners on 100×100×6 elements (`benchmarks/tissue.py lifted`) leave 2.2 µm of penetration at 0.5 and 0.05 µm at 0.9,
+# in 112 and 149 Newton steps: each increment leaves about 0.6 of the gap.
 _LEAST_SETTLING = 0.8
 # Growth of the increment after a solve of at most half of the allowed Newton steps, and its reduction after a failure.
 _GROWTH, _CUT = 1.5, 0.5

@@ -75,7 +75,7 @@ def press_flat(law: AbstractOverclosure, friction: float = 0.0) -> op.Solution:
         window=op.Bonded(),
         sample=op.Contact(law, friction),
     )
-    return op.solve(palpation, op.Imprint(flat), op.Newton(face_rule="nodes"))
+    return op.solve(palpation, op.Imprint(flat), op.Newton(rtol=1e-8, face_rule="nodes"))
 
 
 def gaps(solution: op.Solution) -> np.ndarray:
