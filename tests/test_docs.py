@@ -170,6 +170,13 @@ def test_every_public_name_is_in_the_reference():
     assert {name for name in listed if not hasattr(op, name) and not hasattr(op.datasets, name)} == set()
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_files_that_a_page_names_exist(page):
+    words = (DOCS / page).read_text(encoding="utf-8")
+    named = re.findall(r"\b(?:opfem|tests|benchmarks|notebooks)/[\w/]+\.(?:py|ipynb|md)\b", words)
+    assert [name for name in named if not (DOCS.parent / name).exists()] == []
+
+
 def test_fields_of_the_reference_are_those_of_results(own_map):
     page = (DOCS / "reference" / "file-formats.md").read_text(encoding="utf-8").split("## Variables")[1]
     named = {
