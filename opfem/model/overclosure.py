@@ -67,13 +67,11 @@ class HardOverclosure(AbstractOverclosure):
     """Hard contact: no pressure when open, no penetration when closed.
 
     Augmented Lagrangian: a penalty of `stiffness_ratio` times the stiffness of one element of the layer, and the method
-        of multipliers. Each increment has the pressure of the last one as multiplier; at full load, increments repeat
-        until the update is small. The remaining penetration, `stats["max_penetration"]`, is usually below 0.01 µm. The
-        penalty can
-    then be moderate. A stiff one makes receding contact fail, as where corners of a sample lift off. It affects a
+    of multipliers. Each increment has the pressure of the last one as multiplier; at full load, increments repeat until
+    the update is small. The remaining penetration, `stats["max_penetration"]`, is usually below 0.01 µm. The penalty
+    can then be moderate. A stiff one makes receding contact fail, as where corners of a sample lift off. It affects a
     solution only through the path of friction. Contact with the sample, which may be curved, is integrated at the nodes
-    of the
-    layer: more contact points than nodes would over-constrain it.
+    of the layer: more contact points than nodes would over-constrain it.
 
     `exact=False` is the penalty alone, for a tenth less work. Penetration is then about 1/stiffness_ratio of the
     shortening of an element under the same pressure: about 0.05 µm at 10 kPa.

@@ -57,8 +57,7 @@ class Explicit(eqx.Module):
     """Explicit dynamics: central differences, lumped mass, kinematic contact.
 
     The method of the published maps. The load is applied over `duration` with a smooth amplitude; the layer is
-    quasi-static
-    where its kinetic energy is small: `stats` contains all energies at every output.
+    quasi-static where its kinetic energy is small: `stats` contains all energies at every output.
 
     Contact is pure master–slave at the nodes of the two faces; the rigid bodies are masters. (The weight 0.5 of the
     published decks' pairs has no effect against a rigid body.) Hard contact is exact, other laws are satisfied at the
