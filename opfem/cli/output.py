@@ -1,4 +1,4 @@
-"""What a command writes on top of its result, where asked: pictures as drawings, and maps for other programs."""
+"""Optional files of a command beside its result: vector drawings of the pictures, and maps for other programs."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ def with_drawings(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def pictures(figures: Mapping[str, Any], asked: PictureOptions) -> dict[str, bytes]:
-    """Encode pictures, as drawings too where asked.
+    """Encode pictures, optionally as vector drawings too.
 
     Args:
         figures: Matplotlib figures by file name, which ends in .png.

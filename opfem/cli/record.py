@@ -1,4 +1,4 @@
-"""What a run was told, kept in its result and shown in its report: the command line, and what nobody stated.
+"""Provenance of a run, stored in its result and shown in its report: the command line, and assumed inputs.
 
 An input is named by its place, such as `window.friction`; what a command takes for granted is an assumption.
 """

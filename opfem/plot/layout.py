@@ -65,7 +65,7 @@ def shown_figure(size: tuple[float, float]) -> Figure:
 
 
 def single(ax: Axes | None, limits: Limits) -> Axes:
-    """Return the axes asked for, or those of a new figure for one map."""
+    """Return the given axes, or those of a new figure for one map."""
     return shown_figure(page(1, limits)[1]).subplots() if ax is None else ax
 
 

@@ -23,7 +23,7 @@ _NUMERICAL = ("Mesh", "Map")  # parts whose assumptions are choices of the compu
 
 
 class Check(NamedTuple):
-    """One thing that was looked at.
+    """One check of a result.
 
     Attributes:
         good: Whether all is well.

@@ -22,7 +22,7 @@ _ENERGIES = {
     "damping": "lost to damping",
     "external": "work of the load",
 }
-# Of the Okabe–Ito palette, with a dash each: told apart without colour, too.
+# Of the Okabe–Ito palette, with a dash each: distinct without colour, too.
 _LINES = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#000000")
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "solid")
 

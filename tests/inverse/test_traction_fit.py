@@ -82,8 +82,7 @@ def test_fit_goes_on_from_another(fit, truth):
     again = op.fit_traction(
         palpation(), measured(truth, palpation()), PRIOR, model_std=0.0, start=fit.normal, draws=1, progress=False
     )
-    # Both take 6: the foundation is at the imprint, not at the start, and takes the first step away from it.
-    assert again.stats["forward_solves"] <= fit.stats["forward_solves"]
+    assert again.stats["forward_solves"] < fit.stats["forward_solves"]
     assert jnp.max(jnp.abs(again.normal - fit.normal)) < 1e-2 * jnp.std(truth)
 
 

@@ -104,21 +104,17 @@ def test_25_penetration_falls_as_one_over_the_penalty():
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_25_hard_contact_leaves_neither_penetration_nor_a_gap_under_pressure(friction):
-    """Gaps end below 1e-5 of an element's height, the solver's tolerance.
-
-    Measured: 1e-4 µm at the ratio 30 and 1e-5 µm at 100; the force changes by 2e-6 with and without friction.
-    """
-    no_gap = 1e-5 * L0 / 2
+    """Measured: 1e-5 µm; the force changes with the stiffness by 2e-7 without friction, by 2e-6 with it."""
     force = []
     for ratio in (30.0, 100.0):
         solution = press_flat(op.HardOverclosure(ratio, exact=True), friction)
         gap, pressure = gaps(solution), np.asarray(solution.pressure)
         assert (pressure >= 0.0).all()
-        assert gap.min() > -no_gap
-        np.testing.assert_allclose(gap[pressure > 0.0], 0.0, atol=no_gap)
+        assert gap.min() > -1e-7
+        np.testing.assert_allclose(gap[pressure > 0.0], 0.0, atol=1e-7)
         assert 10 < (pressure == 0.0).sum() < gap.size - 10
         force.append(float(solution.stats["force_sample"][2]))
-    assert force[0] == pytest.approx(force[1], rel=1e-5)
+    assert force[0] == pytest.approx(force[1], rel=1e-6 if friction == 0.0 else 1e-5)
 
 
 def test_25_a_penalty_tends_to_hard_contact():
