@@ -235,7 +235,7 @@ def test_noise_must_be_positive(std):
 @pytest.fixture(scope="module")
 def small():
     """A quick problem: 6 × 6 × 2 elements, two increments; its truth, map and prior."""
-    experiment, settings = palpation((6, 6, 2)), op.Newton(increments=2, max_path=5, rtol=1e-9)
+    experiment, settings = palpation((6, 6, 2)), op.Newton(increments=2, max_path=8, rtol=1e-9)
     prior = op.Matern(length=0.6, std=1e-3, mean=3e-3)
     known = 3e-3 + prior.expand(jax.random.normal(jax.random.key(3), (7, 7)), experiment.mesh().spacing)
     return experiment, settings, prior, known
