@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from ..inverse import LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
+from ..inverse import FitSettings, LogNormal, Matern, TractionFit, fit_traction, uniaxial_estimate
 from ..measurement import ThicknessMap
 from ..model import Contact, MooneyRivlin, Palpation
 from ..results import layer_rows, pressure_rows, summary, to_xarray
-from ..solvers import Newton
 from ..solvers.progress import Progress
 from .folder import EXAMPLE, prepare, settle, write_result
 from .options import ContactOptions, FitOptions, LayerOptions, MapOptions, ResultOptions, RunOptions, StepOptions
@@ -64,6 +63,7 @@ def fit(
             f"  prior: pressure {1e3 * settings['prior_mean']:.3g} ± {1e3 * settings['prior_std']:.3g} kPa, "
             f"correlated over {settings['prior_length']:.3g} mm; noise of the map as given"
         )
+        solver = FitSettings().solver
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", category=UserWarning, module=r"opfem\.")  # shown with the results
             fitted = fit_traction(
@@ -74,7 +74,7 @@ def fit(
                 nonnegative=asked.nonnegative,
                 model_std=asked.model_std,
                 hyperparameters=asked.hyperparameters,
-                solver=Newton(max_path=12) if steps.increments is None else Newton(increments=steps.increments),
+                solver=solver if steps.increments is None else dataclasses.replace(solver, increments=steps.increments),
                 draws=asked.draws,
             )
         progress.stage("pictures")
@@ -128,6 +128,8 @@ def fit_summary(fitted: TractionFit, measured: ThicknessMap) -> dict[str, Any]:
         "effective_dof": float(fitted.effective_dof),
         "observed_dof": float(fitted.observed),
         "misfit_rms_um": 1e3 * float(stats["misfit_rms"]),
+        "mesh_error_um": 1e3 * float(stats["mesh_error"]),
+        "mesh_std_mean_kPa": 1e3 * float(fitted.mesh_std.mean()),
         "model_std_um": 1e3 * float(stats["model_std"]),
         "representation_rms_um": 1e3 * float(stats["representation_rms"]),
         "resolution_um": [1e3 * float(width) for width in fitted.resolution_width],
@@ -166,10 +168,11 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
         ("force on the layer, normal", f"{-numbers['force_sample_N'][2]:.4g}", "N"),
         *pressure_rows(numbers),
         ("its standard deviation, mean", f"{numbers['pressure_std_mean_kPa']:.2g}", "kPa"),
+        ("of it the mesh's, mean", f"{numbers['mesh_std_mean_kPa']:.2g}", "kPa"),
         ("resolution", f"{sorted(numbers['resolution_um'])[len(numbers['resolution_um']) // 2]:.0f}", "µm"),
         *layer_rows(numbers),
         ("measured − computed thickness, rms", f"{numbers['residual_rms_um']:.2g}", "µm"),
-        ("thickness that the mesh misses", f"{numbers['model_std_um']:.2g}", "µm"),
+        ("error of the mesh in thickness, rms", f"{numbers['mesh_error_um']:.2g}", "µm"),
         ("χ² per degree of freedom", f"{numbers['reduced_chi2']:.2f}", ""),
         (
             "forward solves, inner iterations",

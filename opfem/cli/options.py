@@ -294,8 +294,8 @@ class FitOptions:
     model_std: Annotated[
         float | None,
         Parameter(
-            help="Standard deviation of the computed thickness in mm, what the mesh is off. Default: from a solve on "
-            "half the mesh (op.mesh_error).",
+            help="Standard deviation of the computed thickness in mm, added to the map's noise. Default: none, and "
+            "the pressure's includes the mesh error, from a solve on half the mesh.",
             validator=not_negative("mm"),
         ),
     ] = None

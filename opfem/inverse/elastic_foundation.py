@@ -6,6 +6,7 @@ of the steps or fewer. The fit determines the traction transmitted to the layer,
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +20,7 @@ from ..solvers import Newton
 from ..solvers.compiling import QuickJit
 from ..solvers.solution import is_failure
 from ..solvers.solve import prepare
-from ..solvers.stepping import Stepping, outcome
+from ..solvers.stepping import outcome
 from .forward import resume
 from .measured_surface import MeasuredSurface
 from .preconditioner import fit_normal, indentation
@@ -36,13 +37,13 @@ _MAX_INCREMENTS = 200
 class ElasticFoundation(eqx.Module):
     """Springs of stiffness k between the applied normal traction T and the layer.
 
-    They are stress-free at the displacement û(T) that small-strain elasticity predicts near an imprint of the map. The
-    layer receives T + k (u_z - û): to first order T, and exactly T without stiffness.
+    They are stress-free at the displacement û(T) that small-strain elasticity predicts near a solved state. The layer
+    receives T + k (u_z - û): to first order T, and exactly T without stiffness.
 
     Attributes:
         stiffness: Per reference area [MPa/mm].
-        normal: Normal traction under imprints of the maps, per reference area [MPa].
-        uz: Displacement of the interface under these imprints [mm].
+        normal: Normal traction of this state, under each map, per reference area [MPa].
+        uz: Displacement of the interface under it [mm].
         gain: Indentation per pressure of every cosine mode [mm/MPa].
         softness: Local indentation over that of the mean thickness [-].
     """
@@ -71,34 +72,37 @@ def zero_foundation(palpation: Palpation, surfaces: MeasuredSurface, prior: Abst
     return ElasticFoundation(jnp.zeros_like(zeros, shape=()), zeros, zeros, layer.gain, layer.softness)
 
 
-def foundation_at_imprint(
-    foundation: ElasticFoundation, palpation: Palpation, surfaces: MeasuredSurface, solver: Newton, stiffness: float
-) -> ElasticFoundation | None:
-    """Stiffen a foundation about imprints of the maps; None where an imprint cannot be solved.
+class Imprinted(NamedTuple):
+    """Imprints of the maps.
+
+    Attributes:
+        traction: Force on the layer per reference area [MPa].
+        uz: Displacement of the interface [mm].
+    """
+
+    traction: Float[Array, "maps 3 my mx"]
+    uz: Float[Array, "maps my mx"]
+
+
+def solve_imprints(palpation: Palpation, surfaces: MeasuredSurface, solver: Newton) -> Imprinted | None:
+    """Press the maps in; None where one cannot be solved.
 
     Args:
-        foundation: One of zero stiffness.
         palpation: The experiment.
         surfaces: Measured surface of every map, stacked.
         solver: Settings of the solves.
-        stiffness: Foundation stiffness over shear modulus per thickness [-].
     """
-    maps = surfaces.surface.shape[0]
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], surfaces) for i in range(maps)]
     limited = dataclasses.replace(solver, max_increments=min(solver.max_increments, _MAX_INCREMENTS)).as_leaves()
-    ends = [_solve_imprint(palpation, _imprint(palpation, surface), limited) for surface in each]
+    ends = []
+    for i in range(surfaces.surface.shape[0]):
+        load = _imprint(palpation, jax.tree.map(lambda leaf, i=i: leaf[i], surfaces))
+        problem, start = prepare(palpation, load, None, limited, None, False)
+        ends.append(resume(problem, start, limited))
     if any(bool(is_failure(outcome(s))) for s in ends):
         return None
-    scaled = stiffness * palpation.layer.material.shear / jnp.mean(palpation.mesh().thickness)
     area = tributary_area(palpation.mesh().positions()[:, -1])
-    normal = -jnp.stack([s.state.applied.sample.face[2] for s in ends]) / area
-    uz = jnp.stack([s.state.u[2, -1] for s in ends])
-    return ElasticFoundation(scaled, normal, uz, foundation.gain, foundation.softness)
-
-
-def _solve_imprint(palpation: Palpation, load: Imprint, solver: Newton) -> Stepping:
-    problem, start = prepare(palpation, load, None, solver, None, False)
-    return resume(problem, start, solver)
+    traction = jnp.stack([s.state.applied.sample.face for s in ends]) / area
+    return Imprinted(traction, jnp.stack([s.state.u[2, -1] for s in ends]))
 
 
 @QuickJit

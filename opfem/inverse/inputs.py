@@ -76,16 +76,19 @@ def check_inputs(
                 f"fit_traction.inside [mm] must be AxialDisplacement(values, std) at the mesh's nodes "
                 f"(nz+1, ny+1, nx+1) = {(nz + 1, ny + 1, nx + 1)}, one for each map; got {got}."
             )
-    if lateral is not None and not isinstance(lateral, AbstractPrior):
-        if np.shape(lateral) != (2, ny + 1, nx + 1) or not np.all(np.isfinite(lateral)):
+    if isinstance(lateral, str):
+        if lateral not in ("imprint", "friction"):
             raise ValueError(
-                f"fit_traction.lateral [MPa] must be a prior, such as Matern(...), or finite with shape "
-                f"{(2, ny + 1, nx + 1)}: x then y on interface nodes; got shape {np.shape(lateral)}."
+                f'fit_traction.lateral must be "imprint", "friction", a prior or an array [MPa], got {lateral!r}.'
             )
-        lateral = None
-    for name, one in (("prior", prior), ("lateral", lateral)):
-        if one is None and name == "lateral":
-            continue
+    elif not isinstance(lateral, AbstractPrior) and (
+        np.shape(lateral) != (2, ny + 1, nx + 1) or not np.all(np.isfinite(lateral))
+    ):
+        raise ValueError(
+            f"fit_traction.lateral [MPa] must be a prior, such as Matern(...), or finite with shape "
+            f"{(2, ny + 1, nx + 1)}: x then y on interface nodes; got shape {np.shape(lateral)}."
+        )
+    for name, one in (("prior", prior), *([("lateral", lateral)] if isinstance(lateral, AbstractPrior) else [])):
         if not isinstance(one, AbstractPrior):
             raise ValueError(
                 f"fit_traction.{name} must be Matern(...), Tikhonov(...) or TotalVariation(...), got "

@@ -35,7 +35,8 @@ class Objective(eqx.Module):
         surfaces: Measured surface of every map, stacked.
         prior: Prior of the normal traction.
         lateral: Prior of each component of the lateral traction; None: it is not fitted.
-        known_lateral: Lateral traction `(2, ny+1, nx+1)` [MPa] where it is not fitted; None: it follows friction.
+        known_lateral: Lateral traction under every map [MPa] where it is known; None: it is fitted, or follows
+            friction.
         parameters: Priors of fitted numbers, by name.
         forces: Force readings, stacked; None without.
         inside: Displacements inside the layer, stacked; None without.
@@ -48,7 +49,7 @@ class Objective(eqx.Module):
     surfaces: MeasuredSurface
     prior: AbstractPrior
     lateral: AbstractPrior | None
-    known_lateral: Array | None
+    known_lateral: Float[Array, "maps 2 my mx"] | None
     parameters: dict[str, AbstractNumberPrior]
     forces: ForceReading | None
     inside: AxialDisplacement | None
@@ -100,11 +101,11 @@ class Objective(eqx.Module):
     def tractions(self, white: Unknowns) -> Traction:
         """Compute the load of every map, stacked."""
         dead, stiffness = self.foundation.dead_load(self.applied(white)), self.foundation.stiffness
-        if self.lateral is None or white.lateral is None:
-            return jax.vmap(lambda normal: Traction(normal, self.known_lateral, stiffness))(dead)
-        spacing, prior = self.palpation.mesh().spacing, self.lateral
-        mean = on_nodes(prior, white.lateral.shape[1:])
-        lateral = mean + jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
+        lateral = self.known_lateral
+        if self.lateral is not None and white.lateral is not None:
+            spacing, prior = self.palpation.mesh().spacing, self.lateral
+            mean = on_nodes(prior, white.lateral.shape[1:])
+            lateral = mean + jax.vmap(jax.vmap(lambda part: prior.expand(part, spacing)))(white.lateral)
         return jax.vmap(lambda normal, lateral: Traction(normal, lateral, stiffness))(dead, lateral)
 
     def informed(self, draws: list[Unknowns]) -> dict[str, Array]:

@@ -63,8 +63,10 @@ class TractionFit(eqx.Module):
         solution: The layer under the fitted traction, solved to the solver's tolerance. Its load acts through an
             elastic foundation (`Traction.stiffness`), which prevents snap-through on the load path, or as a dead load
             where that fails. `traction` is the transmitted one in both cases.
-        pressure_std: Posterior standard deviation of `pressure`, on the current area [MPa].
-        normal_std: Posterior standard deviation of the normal traction, per reference area [MPa].
+        pressure_std: Standard deviation of `pressure`, on the current area [MPa]: of the posterior, and `mesh_std`.
+        normal_std: Standard deviation of the normal traction, per reference area [MPa]: likewise.
+        mesh_std: Mesh error of `pressure` [MPa]: the change that makes the fit follow `mesh_error`, locally averaged;
+            0 where it is not estimated (`FitSettings.model_std`). The posterior (`draws`, `covariance`) excludes it.
         chi2: Sum of squared standardised misfits between interface and measured surface, of all maps [-].
         effective_dof: Effective number of degrees of freedom that the maps determine [-].
         observed: Number of independent data of the maps on the mesh's splines [-].
@@ -81,15 +83,16 @@ class TractionFit(eqx.Module):
         stats: `forward_solves`, `gauss_newton_steps`, `inner_iterations` (CG iterations, each one product with the
             Jacobian and one with its transpose), `posterior_iterations`, `draws`, `draws_cut_short` (those whose linear
             system reached its limit of iterations), `std_error` (relative standard error of the standard deviations
-            [-]), `representation_rms` [mm] (representation error of the map on mesh-spaced splines), `model_std` [mm]
-            (mesh error included in the noise), `misfit_rms` [mm]; `lateral_informed` [-] where the lateral traction was
-            fitted: its variance reduction, 0 for the prior alone.
+            [-]), `representation_rms` [mm] (representation error of the map on mesh-spaced splines), `mesh_error` [mm]
+            (root mean square of that of the height), `model_std` [mm] (added to the noise), `misfit_rms` [mm];
+            `lateral_informed` [-] where the lateral traction was fitted: its variance reduction, 0 for the prior alone.
         result: Status of the fit.
     """
 
     solution: Solution
     pressure_std: Array
     normal_std: Array
+    mesh_std: Array
     chi2: Array
     effective_dof: Array
     observed: Array
@@ -138,8 +141,8 @@ class TractionFit(eqx.Module):
         if self.reduced_chi2 > _CHI2_BOUNDS[1]:
             return (
                 f"χ² per degree of freedom is {self.reduced_chi2:.3g} and should be near 1: the layer cannot explain "
-                "the map (material, friction, L0, mask), its noise (std) or the mesh error (model_std) is larger than "
-                "given, or the prior is too strong. Standard deviations are then too small."
+                "the map (material, friction, L0, mask), its noise (std) is larger than given, or the prior is too "
+                "strong. Standard deviations are then too small."
             )
         if self.reduced_chi2 < _CHI2_BOUNDS[0]:
             # Maps of OCT volumes of a coin: 0.41 at 16×16×4 elements, 0.15 at 40×40×4; coverage 91 and 99.7 %.

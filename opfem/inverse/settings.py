@@ -18,10 +18,10 @@ class FitSettings(eqx.Module):
 
     Attributes:
         nonnegative: Constrain the traction to be non-negative, by a softplus.
-        model_std: Standard deviation of the computed height [mm], independent from element to element: above all the
-            mesh error. Without it the many pixels of a map overrate a coarse mesh. None: the root mean square of
-            `mesh_error` under the traction of a first fit, which then continues; 0 where that cannot be estimated, for
-            an odd or small number of elements along an axis. `stats["model_std"]` reports it.
+        model_std: Standard deviation of the computed height [mm], independent from element to element, that is added to
+            the map's noise. None: 0, and the standard deviations include what `mesh_error` changes in the traction
+            (`TractionFit.mesh_std`); they do not for an odd or small number of elements along an axis, where it cannot
+            be estimated.
         hyperparameters: "given": the prior as it is. "discrepancy": its standard deviation (or weight) at which χ² of
             the map equals its expectation, the strongest prior that the data allow. "evidence": standard deviation and
             length of maximum likelihood (Laplace).
@@ -61,8 +61,8 @@ class FitSettings(eqx.Module):
     model_std: ScalarLike | None = None
     hyperparameters: Choice = "given"
     start: ArrayLike | None = None
-    solver: Newton = Newton(max_path=12)
-    rtol: float = 3e-3
+    solver: Newton = Newton(rtol=1e-4, max_path=24)
+    rtol: float = 1e-2
     max_steps: int = 50
     draws: int = 16
     key: PRNGKeyArray | None = None

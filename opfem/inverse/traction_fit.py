@@ -1,9 +1,10 @@
 """`fit_traction`: the traction that explains measured maps, with its uncertainty (route B)."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,17 +16,17 @@ from .._checks import as_leaf
 from ..measurement import ThicknessMap
 from ..mechanics.face import tributary_area
 from ..model import Contact, Palpation
-from ..optimise.conjugate_gradients import QuasiNewtonInverse
+from ..optimise.conjugate_gradients import QuasiNewtonInverse, plus
 from ..optimise.gauss_newton import GaussNewton, PreconditionedDescent
-from ..solvers import ConvergenceError
+from ..solvers import ConvergenceError, Solution
 from ..solvers.compiling import QuickJit, compiled_meanwhile
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
 from .discrepancy import next_factor
-from .elastic_foundation import ElasticFoundation, foundation_at_imprint, zero_foundation
+from .elastic_foundation import Imprinted, solve_imprints, zero_foundation
 from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
 from .jacobian import Point, programs
-from .measured_surface import project_map
+from .measured_surface import MeasuredSurface, project_map
 from .model_error import can_halve, mesh_error
 from .objective import Objective, interface_displacement, normal_traction
 from .observations import AxialDisplacement, ForceReading
@@ -34,8 +35,17 @@ from .preconditioner import Unknowns, fit_normal
 from .prior import AbstractPrior, on_nodes
 from .result import FitError, FitStatus, TractionFit
 from .settings import FitSettings
-from .uncertainty import MAX_ITERATIONS, Posterior, number_covariance, pressure_deviations, resolution, root_mean_square
-from .warm_start import from_linear_estimate, from_normal
+from .uncertainty import (
+    MAX_ITERATIONS,
+    Posterior,
+    local_size,
+    number_covariance,
+    pressure_deviations,
+    resolution,
+    root_mean_square,
+    transmitting,
+)
+from .warm_start import from_linear_estimate, from_normal, interpolated
 
 # Shown on the progress line during compilation.
 _COMPILES = "the programs of a fit, about a minute the first time"
@@ -52,15 +62,15 @@ def fit_traction(
     parameters: Mapping[str, AbstractNumberPrior] | None = None,
     forces: ForceReading | Sequence[ForceReading] | None = None,
     inside: AxialDisplacement | Sequence[AxialDisplacement] | None = None,
-    lateral: AbstractPrior | ArrayLike | None = None,
+    lateral: AbstractPrior | ArrayLike | Literal["imprint", "friction"] = "imprint",
     settings: FitSettings = FitSettings(),
     **changed: Any,
 ) -> TractionFit:
     """Find the traction on the interface that explains measured maps.
 
     Nonlinear least squares over misfit and priors, by Gauss–Newton through the nonlinear solve with its friction
-    history. The normal traction is fitted; the lateral one follows the sample's friction (`Traction`) unless `lateral`
-    is given. An elastic foundation, at rest near an imprint of the map, stabilises the forward solves.
+    history. The normal traction is fitted; the lateral one is that of an imprint of the map unless `lateral` is
+    given. An elastic foundation, at rest near this imprint, stabilises the forward solves.
 
     Args:
         palpation: The experiment; its sample a `Contact`, its elements hexahedra.
@@ -72,9 +82,11 @@ def fit_traction(
             scaled with) and "l0_offset" [mm]. A narrow prior propagates the uncertainty of a known number.
         forces: Measured force under each map.
         inside: Displacements inside the layer under each map.
-        lateral: Known lateral traction `(2, ny+1, nx+1)` [MPa], such as `traction[:2]` of an imprint: contact with a
-            steep surface has a lateral component besides friction. Or the prior of each component, which is then
-            fitted; a thickness map identifies it poorly, see `stats["lateral_informed"]` of the fit.
+        lateral: "imprint": that of an imprint of the map, which includes the push of a steep surface along its
+            normal, 14 % of the normal traction on the published coin. "friction": the sample's friction alone, as under
+            a `Traction`; also where no imprint is solved, or the material or the sample's friction are fitted, which
+            change the imprint. Or a known lateral traction `(2, ny+1, nx+1)` [MPa]. Or the prior of each component,
+            which is then fitted; a thickness map identifies it poorly, see `stats["lateral_informed"]` of the fit.
         settings: Options and tuning, see `FitSettings`.
         **changed: Single settings by name, such as `draws=32`, in place of those in `settings`.
 
@@ -90,7 +102,7 @@ def fit_traction(
     settings = settings.changed(**changed)
     maps = as_tuple(thickness)
     parameters = dict(sorted((parameters or {}).items()))  # the order of every PyTree
-    if lateral is not None and not isinstance(lateral, AbstractPrior):
+    if not isinstance(lateral, (AbstractPrior, str)):
         lateral = as_leaf(lateral, "fit_traction.lateral", "MPa")
     inputs = {"palpation": palpation, "thickness": maps, "prior": prior, "parameters": parameters, "lateral": lateral}
     require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=settings.solver.as_leaves())
@@ -102,10 +114,10 @@ def fit_traction(
         run = _Run(objective, settings, bar)
         given = None if settings.start is None else from_normal(settings.start, objective)
         with compiled_meanwhile(programs(objective, objective.white(objective.surfaces.surface))):
-            foundation = _foundation(run)
-        reached = _fit_with_fallbacks(run, foundation, given)
-        if settings.model_std is None and not _failed(reached):
-            reached = _with_mesh_error(run, reached, maps)
+            presses = _presses(settings)
+            imprinted = solve_imprints(palpation, objective.surfaces, settings.solver) if presses else None
+        takes_lateral = isinstance(lateral, str) and objective.known_lateral is not None
+        reached = _fit_with_fallbacks(run, imprinted, takes_lateral, given)
         if not _failed(reached) and settings.hyperparameters != "given":
             reached = _with_chosen_prior(run, reached)
         if settings.throw and _failed(reached):
@@ -125,10 +137,10 @@ def _objective(
     parameters: dict[str, AbstractNumberPrior],
     forces: ForceReading | None,
     inside: AxialDisplacement | None,
-    lateral: AbstractPrior | Array | None,
+    lateral: AbstractPrior | Array | str,
     settings: FitSettings,
 ) -> Objective:
-    """Project the maps and build the objective under a dead load."""
+    """Project the maps and build the objective under a dead load, the lateral traction of an imprint still 0."""
     model_std = 0.0 if settings.model_std is None else settings.model_std
     model_std = as_leaf(model_std, "fit_traction.model_std", "mm")
     surfaces = _project_maps(palpation.mesh(), *stacked_maps(maps), model_std)
@@ -138,7 +150,7 @@ def _objective(
         surfaces=surfaces,
         prior=prior,
         lateral=lateral if isinstance(lateral, AbstractPrior) else None,
-        known_lateral=None if isinstance(lateral, AbstractPrior) else lateral,
+        known_lateral=_known_lateral(lateral, surfaces, parameters, settings),
         parameters=parameters,
         forces=forces,
         inside=inside,
@@ -235,56 +247,75 @@ def _status(state: Any, done: Array, stall: float) -> FitStatus:
     return FitStatus.stalled if state.search_state.step_size < stall else FitStatus.max_steps_reached
 
 
-def _foundation(run: _Run) -> ElasticFoundation | None:
-    """Make the elastic foundation about imprints of the maps; None where a dead load is applied."""
-    objective, settings = run.objective, run.settings
-    if settings.nonnegative or settings.foundation_stiffness == 0.0:
-        return None
-    return foundation_at_imprint(
-        objective.foundation, objective.palpation, objective.surfaces, settings.solver, settings.foundation_stiffness
+def _presses(settings: FitSettings) -> bool:
+    """Return whether the fit starts with imprints of the maps."""
+    return not settings.nonnegative and settings.foundation_stiffness != 0.0
+
+
+def _known_lateral(
+    lateral: AbstractPrior | Array | str, surfaces: MeasuredSurface, parameters: Mapping, settings: FitSettings
+) -> Array | None:
+    """Return the lateral traction, for now 0 where it is that of an imprint; None: fitted, or due to friction."""
+    maps, my, mx = surfaces.surface.shape
+    if isinstance(lateral, str):
+        constant = not any(name.startswith(("layer.material", "sample.friction")) for name in parameters)
+        known = lateral == "imprint" and _presses(settings) and constant
+        return jnp.zeros((maps, 2, my, mx)) if known else None
+    return None if isinstance(lateral, AbstractPrior) else jnp.broadcast_to(lateral, (maps, 2, my, mx))
+
+
+def _near(run: _Run, imprinted: Imprinted, takes_lateral: bool) -> Objective:
+    """Put the elastic foundation to rest at the imprints, and apply their lateral traction."""
+    objective, palpation = run.objective, run.objective.palpation
+    stiffness = run.settings.foundation_stiffness * palpation.layer.material.shear
+    foundation = dataclasses.replace(
+        objective.foundation,
+        stiffness=stiffness / jnp.mean(palpation.mesh().thickness),
+        normal=-imprinted.traction[:, 2],
+        uz=imprinted.uz,
     )
+    lateral = imprinted.traction[:, :2] if takes_lateral else objective.known_lateral
+    return dataclasses.replace(objective, foundation=foundation, known_lateral=lateral)
 
 
-def _initial_guesses(
-    objective: Objective, foundation: ElasticFoundation | None, given: Unknowns | None
-) -> Iterator[tuple[ElasticFoundation, Unknowns]]:
-    """Yield foundations with initial unknowns, the most promising first."""
-    if foundation is not None:
-        yield foundation, objective.white(foundation.normal) if given is None else given
-    yield objective.foundation, from_linear_estimate(objective) if given is None else given
+def _transmitting(run: _Run, given: Unknowns) -> Unknowns:
+    """Find unknowns under which the foundation transmits the traction of given ones, to first order."""
+    run.solves += 1
+    point = Point(run.objective, given)
+    missing = run.objective.applied(given) - normal_traction(point.residuals)
+    return plus(given, transmitting(point.jacobian(), given, run.objective, missing)[0])
+
+
+def _initial_guesses(objective: Objective, given: Unknowns | None) -> Iterator[Unknowns]:
+    """Yield initial unknowns under a dead load, the most promising first."""
+    yield from_linear_estimate(objective) if given is None else given
     if objective.prior.mean is not None:
         # No equilibrium exists under the linear estimate: start from the prior's mean.
-        yield objective.foundation, jax.tree.map(jnp.zeros_like, objective.white(objective.surfaces.surface))
+        yield jax.tree.map(jnp.zeros_like, objective.white(objective.surfaces.surface))
 
 
-def _fit_with_fallbacks(run: _Run, foundation: ElasticFoundation | None, given: Unknowns | None) -> _Reached:
-    """Fit on the elastic foundation, if there is one; under a dead load where that fails."""
-    objective, least = run.objective, run.settings.contact_pressure
-    for used, white in _initial_guesses(objective, foundation, given):
-        run.objective = eqx.tree_at(lambda m: m.foundation, objective, used)
-        reached = run.fit(white)
-        if not _failed(reached) and used is foundation and not bool(_in_contact(reached, objective.palpation, least)):
+def _fit_with_fallbacks(
+    run: _Run, imprinted: Imprinted | None, takes_lateral: bool, given: Unknowns | None
+) -> _Reached:
+    """Fit on the elastic foundation, if imprints are solved; under a dead load where that fails."""
+    objective = run.objective
+    if takes_lateral:
+        objective = dataclasses.replace(objective, known_lateral=None)  # of the dead load, without imprint
+    if imprinted is not None:
+        run.objective = _near(run, imprinted, takes_lateral)
+        normal = run.objective.foundation.normal
+        reached = run.fit(run.objective.white(normal) if given is None else _transmitting(run, given))
+        if not _failed(reached) and not bool(_in_contact(reached, objective.palpation, run.settings.contact_pressure)):
             # The layer has lifted off its window, and the foundation alone balances the load.
             reached = reached._replace(result=FitStatus.no_equilibrium)
         if not _failed(reached) or bool(reached.result == FitStatus.max_steps_reached):
+            return reached
+    for white in _initial_guesses(objective, given):
+        run.objective = objective
+        reached = run.fit(white)
+        if not _failed(reached) or bool(reached.result == FitStatus.max_steps_reached):
             break
     return reached
-
-
-def _with_mesh_error(run: _Run, reached: _Reached, maps: tuple[ThicknessMap, ...]) -> _Reached:
-    """Continue with the mesh error included in the noise; unchanged where it cannot be estimated."""
-    objective = run.objective
-    if not can_halve(objective.palpation.elements):
-        return reached
-    run.bar.stage("mesh error", compiles=_COMPILES_HALF)
-    try:
-        errors = [mesh_error(path.solution(objective.solver), objective.solver) for path in reached.point.paths]
-    except ConvergenceError:
-        return reached
-    model_std = jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2))
-    surfaces = _project_maps(objective.palpation.mesh(), *stacked_maps(maps), model_std)
-    run.objective = eqx.tree_at(lambda m: m.surfaces, objective, surfaces)
-    return run.fit(reached.white)
 
 
 _project_maps = QuickJit(jax.vmap(project_map, in_axes=(None, 0, 0, None)))
@@ -328,6 +359,29 @@ def _with_chosen_prior(run: _Run, reached: _Reached) -> _Reached:
     return reached
 
 
+def _missed(run: _Run, reached: _Reached, solutions: list[Solution]) -> tuple[Array, Array, Array]:
+    """Estimate the mesh error of every map: of the height (rms), and of the fitted normal traction and interface.
+
+    Returns:
+        Root mean square of the height's error [mm]; change of the normal traction [MPa] and of the interface [mm] that
+        the fit would make to follow it. All are 0 where the error cannot be estimated, or a `model_std` is given.
+    """
+    objective, nothing = run.objective, jax.tree.map(jnp.zeros_like, reached.residuals)
+    none = jnp.zeros(()), normal_traction(nothing), interface_displacement(nothing)
+    if run.settings.model_std is not None or not can_halve(objective.palpation.elements):
+        return none
+    run.bar.stage("mesh error", compiles=_COMPILES_HALF)
+    try:
+        errors = [mesh_error(one, objective.solver) for one in solutions]
+    except ConvergenceError:
+        return none
+    heights = interpolated(jnp.stack(errors), *objective.surfaces.surface.shape)
+    misfit = jax.vmap(lambda surface, change: surface.misfit_change(change))(objective.surfaces, heights)
+    change = {**nothing, "maps": misfit}
+    followed = plus(change, reached.posterior.solve(change).residual, -1.0)
+    return jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2)), normal_traction(followed), interface_displacement(followed)
+
+
 def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
     objective, draws = run.objective, run.settings.draws
     solutions = [path.solution(objective.solver) for path in reached.point.paths]
@@ -345,6 +399,9 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
             run.bar.show(f"posterior, draw {count + 1} of {draws}", (count + 1) / draws)
     deviations = jnp.stack(deviations)
     pressures = pressure_deviations(solutions, deviations, jnp.stack(moves))
+    missed, of_normal, of_interface = _missed(run, reached, solutions)
+    normal_error = local_size(of_normal)
+    pressure_error = local_size(pressure_deviations(solutions, of_normal[None], of_interface[None])[0])
     residual = reached.point.heights - objective.surfaces.surface
     points, widths = resolution(reached.posterior, objective)
     solution = jax.tree.map(lambda *v: jnp.stack(v), *solutions)
@@ -354,8 +411,9 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
 
     return TractionFit(
         solution=one_or_all(solution),
-        pressure_std=one_or_all(root_mean_square(pressures)),
-        normal_std=one_or_all(root_mean_square(deviations)),
+        pressure_std=one_or_all(jnp.hypot(root_mean_square(pressures), pressure_error)),
+        normal_std=one_or_all(jnp.hypot(root_mean_square(deviations), normal_error)),
+        mesh_std=one_or_all(pressure_error),
         chi2=jnp.sum(reached.residuals["maps"] ** 2),
         effective_dof=jnp.mean(jnp.stack(dof)),
         observed=jnp.sum(objective.surfaces.informed),
@@ -376,6 +434,7 @@ def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
             "std_error": 1.0 / (2.0 * draws) ** 0.5,
             "representation_rms": jnp.sqrt(jnp.mean(objective.surfaces.representation_rms**2)),
             "model_std": objective.surfaces.model_std[0],
+            "mesh_error": missed,
             "misfit_rms": jnp.sqrt(jnp.mean(residual**2)),
             **objective.informed(whites),
         },

@@ -29,7 +29,7 @@ MAX_ITERATIONS = 200
 _RTOL = 1e-2
 # Points along each axis of the grid that resolution is computed on: kernels must not overlap.
 _GRID = 4
-# Fixed-point iterations that find the applied traction whose transmitted part is a unit change at single points.
+# Fixed-point iterations that find the applied traction of a transmitted one.
 _PASSES = 4
 # Full width at half maximum over the standard deviation of a Gaussian.
 _FWHM = np.sqrt(8.0 * np.log(2.0))
@@ -183,6 +183,18 @@ def root_mean_square(deviations: Float[Array, "draws maps my mx"]) -> Float[Arra
     return jnp.sqrt(jnp.mean(deviations**2, axis=0))
 
 
+def local_size(error: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:
+    """Compute the root mean square of an error over the 3 × 3 nodes around each.
+
+    The error is a wave, and vanishes where it changes its sign. On the built-in example the standard deviations cover
+    the traction on twice as fine a mesh (1.96 of them) at 89 % of nodes with the error itself, at 95 % with its size,
+    at 65 % without.
+    """
+    padded = jnp.pad(error**2, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    my, mx = error.shape[1:]
+    return jnp.sqrt(sum(padded[:, i : i + my, j : j + mx] for i in range(3) for j in range(3)) / 9.0)
+
+
 def normal_covariance(posterior: Posterior, weights: Float[Array, "maps my mx"]) -> Float[Array, "maps my mx"]:
     """Compute the product of the posterior covariance of the normal traction with weights [-]."""
     nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), posterior.residual_structure())
@@ -236,15 +248,23 @@ def resolution(
 
 def _image(posterior: Posterior, objective: Objective, points: Array) -> Array:
     """Compute the fit's response to the change of the maps under unit changes of the traction at some nodes."""
-    slope = _slope(posterior.white, objective)
-    change = jax.tree.map(jnp.zeros_like, posterior.white)
-    transmitted = jnp.zeros_like(points)
-    for _ in range(_PASSES + 1):
-        change = change._replace(normal=change.normal + _white(objective, (points - transmitted) / slope))
-        residuals = posterior.push(change)
-        transmitted = normal_traction(residuals)
+    _, residuals = transmitting(posterior.jacobian, posterior.white, objective, points)
     data = {name: part if name == "maps" else jax.tree.map(jnp.zeros_like, part) for name, part in residuals.items()}
     return normal_traction(posterior.push(posterior.solve(data).x))
+
+
+def transmitting(
+    jacobian: Any, white: Unknowns, objective: Objective, wanted: Float[Array, "maps my mx"]
+) -> tuple[Unknowns, dict[str, Any]]:
+    """Find the change of the unknowns whose transmitted normal traction [MPa] is wanted, and that of the residuals."""
+    slope = _slope(white, objective)
+    change = jax.tree.map(jnp.zeros_like, white)
+    transmitted = jnp.zeros_like(wanted)
+    for _ in range(_PASSES + 1):
+        change = change._replace(normal=change.normal + _white(objective, (wanted - transmitted) / slope))
+        residuals = jacobian.mv(change)
+        transmitted = normal_traction(residuals)
+    return change, residuals
 
 
 @QuickJit

@@ -19,7 +19,7 @@ from .conjugate_gradients import LeastSquares, Secants, dot, least_squares, plus
 from .line_search import ParabolicBacktracking, SearchState
 
 # Largest CG tolerance, far from the optimum.
-_LARGEST_RTOL = 0.03
+_LARGEST_RTOL = 0.2
 # A Gauss–Newton direction changes the residuals by at most their norm; 1 % for inexact products. Secants without
 # the restart predicted up to 11 times that. Fits of friction and C10 take 13 to 29 forward solves, not 24 to 69.
 _LARGEST_CHANGE = 1.01

@@ -270,6 +270,7 @@ def _image(solution: Solution | ExperimentSolution) -> dict[str, Variable]:
 def _fit(fit: TractionFit) -> dict[str, Variable]:
     return {
         "pressure_std": variable(NODES, fit.pressure_std, "MPa", "posterior standard deviation of the pressure"),
+        "mesh_std": variable(NODES, fit.mesh_std, "MPa", "mesh error of the pressure, included in pressure_std"),
         "normal_std": variable(
             NODES, fit.normal_std, "MPa", "posterior standard deviation of the normal traction per reference area"
         ),

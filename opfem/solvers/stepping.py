@@ -26,10 +26,6 @@ from .snap_through import SnapThrough
 from .solution import RESULTS
 from .tangent import Unknowns
 
-# Tolerance of gaps of hard contact over the size of an element: 1 nm, the resolution of the phase of OCT; the relative
-# tolerance of the residual where that is smaller, so that a tighter solve closes gaps as well.
-_NO_GAP = 1e-5
-
 
 class Stepping(NamedTuple):
     """State of the load stepping.
@@ -101,7 +97,7 @@ def attempt(problem: AbstractProblem, s: Stepping, settings: Newton) -> Stepping
         steps=result.steps,
         furthest=_furthest(result.state.u, s.origin.u),
         missed_gap=problem.missed_gap(s.origin, result.state),
-        no_gap=jnp.minimum(_NO_GAP, settings.rtol) * problem.element_depth,
+        no_gap=settings.rtol * problem.element_depth,
     )
     return _updated(problem, s, trial, result, settings)
 
