@@ -294,8 +294,8 @@ class FitOptions:
     model_std: Annotated[
         float | None,
         Parameter(
-            help="Standard deviation of the computed thickness in mm, added to the map's noise. Default: none, and "
-            "the pressure's includes the mesh error, from a solve on half the mesh.",
+            help="Standard deviation of the computed thickness in mm, added to the map's noise. Default: what splines "
+            "of the mesh cannot follow; and the pressure's includes the mesh error, from a solve on half the mesh.",
             validator=not_negative("mm"),
         ),
     ] = None

@@ -1,4 +1,4 @@
-"""Checks of the arguments of a fit, and their stacking over maps."""
+"""Arguments of a fit: their checks, their stacking over maps, and the objective that they state."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,13 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._checks import as_leaf
 from ..measurement import ThicknessMap
 from ..model import Contact, Palpation
 from ..model.plausible import check_against_layer
-from .measured_surface import MeasuredSurface, noise_std
-from .observations import AxialDisplacement
-from .parameters import check_parameters
+from ..solvers.compiling import QuickJit
+from .elastic_foundation import zero_foundation
+from .measured_surface import MeasuredSurface, noise_std, project_map, unresolved_std
+from .objective import Objective
+from .observations import AxialDisplacement, ForceReading
+from .parameters import AbstractNumberPrior, check_parameters
 from .prior import AbstractPrior
+from .settings import FitSettings
 
 
 def as_tuple(value: Any) -> tuple:
@@ -107,3 +112,55 @@ def check_covered(maps: tuple[ThicknessMap, ...], surfaces: MeasuredSurface) -> 
                 f"{np.asarray(m.origin + m.extent).tolist()} mm, {float(np.mean(m.mask)):.0%} of it masked. "
                 "Pass ThicknessMap(origin=...) that matches, or unmask pixels."
             )
+
+
+def state_objective(
+    palpation: Palpation,
+    maps: tuple[ThicknessMap, ...],
+    prior: AbstractPrior,
+    parameters: dict[str, AbstractNumberPrior],
+    forces: ForceReading | None,
+    inside: AxialDisplacement | None,
+    lateral: AbstractPrior | Array | str,
+    settings: FitSettings,
+) -> Objective:
+    """Project the maps and build the objective under a dead load, the lateral traction of an imprint still 0."""
+    stacked_map, std = stacked_maps(maps)
+    given = 0.0 if settings.model_std is None else settings.model_std
+    surfaces = _project_maps(palpation.mesh(), stacked_map, std, as_leaf(given, "fit_traction.model_std", "mm"))
+    if settings.model_std is None:
+        surfaces = _project_maps(palpation.mesh(), stacked_map, std, unresolved_std(surfaces, std))
+    check_covered(maps, surfaces)
+    return Objective(
+        palpation=palpation,
+        surfaces=surfaces,
+        prior=prior,
+        lateral=lateral if isinstance(lateral, AbstractPrior) else None,
+        known_lateral=_known_lateral(lateral, surfaces, parameters, settings),
+        parameters=parameters,
+        forces=forces,
+        inside=inside,
+        softness=settings.softness * palpation.layer.material.shear if settings.nonnegative else None,
+        foundation=zero_foundation(palpation, surfaces, prior),
+        solver=settings.solver.as_leaves(),
+    )
+
+
+def presses(settings: FitSettings) -> bool:
+    """Return whether the fit starts with imprints of the maps."""
+    return not settings.nonnegative and settings.foundation_stiffness != 0.0
+
+
+def _known_lateral(
+    lateral: AbstractPrior | Array | str, surfaces: MeasuredSurface, parameters: Mapping, settings: FitSettings
+) -> Array | None:
+    """Return the lateral traction, for now 0 where it is that of an imprint; None: fitted, or due to friction."""
+    maps, my, mx = surfaces.surface.shape
+    if isinstance(lateral, str):
+        constant = not any(name.startswith(("layer.material", "sample.friction")) for name in parameters)
+        known = lateral == "imprint" and presses(settings) and constant
+        return jnp.zeros((maps, 2, my, mx)) if known else None
+    return None if isinstance(lateral, AbstractPrior) else jnp.broadcast_to(lateral, (maps, 2, my, mx))
+
+
+_project_maps = QuickJit(jax.vmap(project_map, in_axes=(None, 0, 0, None)))

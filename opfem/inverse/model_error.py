@@ -1,14 +1,19 @@
-"""Discretisation error of the interface height, by Richardson extrapolation."""
+"""Discretisation error of the interface height, by Richardson extrapolation, and what it changes in a fit."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Traction
+from ..optimise.conjugate_gradients import plus
 from ..solvers import Newton, Solution, solve
 from .measured_surface import interface_heights
+from .objective import Objective, interface_displacement, normal_traction
+from .uncertainty import Posterior
+from .warm_start import interpolated
 
 # Second-order convergence: on half as many elements along each axis the error is four times as large.
 _SECOND_ORDER = 3.0
@@ -18,8 +23,8 @@ def mesh_error(solution: Solution, solver: Newton = Newton()) -> Float[Array, "h
     """Estimate the discretisation error of the interface height by a solve on half as many elements along each axis.
 
     The error is a third of the difference (Richardson extrapolation of a second-order method). It is overestimated
-    where half of the mesh does not resolve the load. Its root mean square is the default of `fit_traction(model_std=)`.
-    Refine the mesh where it is well above the map's noise per element.
+    where half of the mesh does not resolve the load. Refine the mesh where it is well above the map's noise per
+    element.
 
     Args:
         solution: A solve under a traction, such as `TractionFit.solution`.
@@ -55,3 +60,38 @@ def can_halve(elements: tuple[int, int, int]) -> bool:
 
 def _every_other(values: Array) -> Array:
     return values[..., ::2, ::2] if jnp.ndim(values) >= 2 else values
+
+
+class FollowedError(NamedTuple):
+    """Mesh error of a fit.
+
+    Attributes:
+        height: Root mean square of that of the interface height [mm].
+        normal: Change of the normal traction that makes the fit follow it [MPa].
+        moved: Change of the interface's displacement with it [mm].
+    """
+
+    height: Array
+    normal: Float[Array, "maps my mx"]
+    moved: Float[Array, "maps 3 my mx"]
+
+
+def followed_error(posterior: Posterior, objective: Objective, solutions: list[Solution]) -> FollowedError:
+    """Estimate the mesh error under every map's traction, and the change of the fit that follows it.
+
+    Args:
+        posterior: Posterior of the fit.
+        objective: Its objective.
+        solutions: The layer under the fitted traction of every map.
+
+    Raises:
+        ConvergenceError: If a solve on half the mesh fails.
+    """
+    surfaces = objective.surfaces
+    errors = jnp.stack([mesh_error(one, objective.solver) for one in solutions])
+    heights = interpolated(errors, *surfaces.surface.shape)
+    nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), posterior.residual_structure())
+    change = {**nothing, "maps": jax.vmap(lambda one, change: one.misfit_change(change))(surfaces, heights)}
+    followed = plus(change, posterior.solve(change).residual, -1.0)
+    height = jnp.sqrt(jnp.mean(errors**2))
+    return FollowedError(height, normal_traction(followed), interface_displacement(followed))

@@ -19,8 +19,9 @@ class FitSettings(eqx.Module):
     Attributes:
         nonnegative: Constrain the traction to be non-negative, by a softplus.
         model_std: Standard deviation of the computed height [mm], independent from element to element, that is added to
-            the map's noise. None: 0, and the standard deviations include what `mesh_error` changes in the traction
-            (`TractionFit.mesh_std`); they do not for an odd or small number of elements along an axis, where it cannot
+            the map's noise. None: the part of the representation error that exceeds the noise, which the mesh misses as
+            well; and the standard deviations include what `mesh_error` changes in the traction
+            (`TractionFit.mesh_std`). They do not for an odd or small number of elements along an axis, where it cannot
             be estimated.
         hyperparameters: "given": the prior as it is. "discrepancy": its standard deviation (or weight) at which χ² of
             the map equals its expectation, the strongest prior that the data allow. "evidence": standard deviation and

@@ -4,6 +4,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -19,15 +20,14 @@ from ..model import Contact, Palpation
 from ..optimise.conjugate_gradients import QuasiNewtonInverse, plus
 from ..optimise.gauss_newton import GaussNewton, PreconditionedDescent
 from ..solvers import ConvergenceError, Solution
-from ..solvers.compiling import QuickJit, compiled_meanwhile
+from ..solvers.compiling import compiled_meanwhile
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
 from .discrepancy import next_factor
-from .elastic_foundation import Imprinted, solve_imprints, zero_foundation
-from .inputs import as_tuple, check_covered, check_inputs, stacked, stacked_maps
+from .elastic_foundation import Imprinted, solve_imprints
+from .inputs import as_tuple, check_inputs, presses, stacked, state_objective
 from .jacobian import Point, programs
-from .measured_surface import MeasuredSurface, project_map
-from .model_error import can_halve, mesh_error
+from .model_error import FollowedError, can_halve, followed_error
 from .objective import Objective, interface_displacement, normal_traction
 from .observations import AxialDisplacement, ForceReading
 from .parameters import AbstractNumberPrior
@@ -45,7 +45,7 @@ from .uncertainty import (
     root_mean_square,
     transmitting,
 )
-from .warm_start import from_linear_estimate, from_normal, interpolated
+from .warm_start import from_linear_estimate, from_normal
 
 # Shown on the progress line during compilation.
 _COMPILES = "the programs of a fit, about a minute the first time"
@@ -108,14 +108,13 @@ def fit_traction(
     require_float64("fit_traction", **inputs, forces=forces, inside=inside, solver=settings.solver.as_leaves())
     check_inputs(palpation, maps, prior, lateral, parameters, as_tuple(inside))
     readings = stacked("forces", forces, len(maps)), stacked("inside", inside, len(maps))
-    objective = _objective(palpation, maps, prior, parameters, *readings, lateral, settings)
+    objective = state_objective(palpation, maps, prior, parameters, *readings, lateral, settings)
     with Progress(settings.progress) as bar:
         bar.stage("imprint", compiles=_COMPILES)
         run = _Run(objective, settings, bar)
         given = None if settings.start is None else from_normal(settings.start, objective)
         with compiled_meanwhile(programs(objective, objective.white(objective.surfaces.surface))):
-            presses = _presses(settings)
-            imprinted = solve_imprints(palpation, objective.surfaces, settings.solver) if presses else None
+            imprinted = solve_imprints(palpation, objective.surfaces, settings.solver) if presses(settings) else None
         takes_lateral = isinstance(lateral, str) and objective.known_lateral is not None
         reached = _fit_with_fallbacks(run, imprinted, takes_lateral, given)
         if not _failed(reached) and settings.hyperparameters != "given":
@@ -128,36 +127,6 @@ def fit_traction(
     if judged and fit.reduced_chi2 > 1.0 and fit.advice():
         warnings.warn(fit.advice(), stacklevel=2)
     return fit
-
-
-def _objective(
-    palpation: Palpation,
-    maps: tuple[ThicknessMap, ...],
-    prior: AbstractPrior,
-    parameters: dict[str, AbstractNumberPrior],
-    forces: ForceReading | None,
-    inside: AxialDisplacement | None,
-    lateral: AbstractPrior | Array | str,
-    settings: FitSettings,
-) -> Objective:
-    """Project the maps and build the objective under a dead load, the lateral traction of an imprint still 0."""
-    model_std = 0.0 if settings.model_std is None else settings.model_std
-    model_std = as_leaf(model_std, "fit_traction.model_std", "mm")
-    surfaces = _project_maps(palpation.mesh(), *stacked_maps(maps), model_std)
-    check_covered(maps, surfaces)
-    return Objective(
-        palpation=palpation,
-        surfaces=surfaces,
-        prior=prior,
-        lateral=lateral if isinstance(lateral, AbstractPrior) else None,
-        known_lateral=_known_lateral(lateral, surfaces, parameters, settings),
-        parameters=parameters,
-        forces=forces,
-        inside=inside,
-        softness=settings.softness * palpation.layer.material.shear if settings.nonnegative else None,
-        foundation=zero_foundation(palpation, surfaces, prior),
-        solver=settings.solver.as_leaves(),
-    )
 
 
 class _Reached(NamedTuple):
@@ -247,23 +216,6 @@ def _status(state: Any, done: Array, stall: float) -> FitStatus:
     return FitStatus.stalled if state.search_state.step_size < stall else FitStatus.max_steps_reached
 
 
-def _presses(settings: FitSettings) -> bool:
-    """Return whether the fit starts with imprints of the maps."""
-    return not settings.nonnegative and settings.foundation_stiffness != 0.0
-
-
-def _known_lateral(
-    lateral: AbstractPrior | Array | str, surfaces: MeasuredSurface, parameters: Mapping, settings: FitSettings
-) -> Array | None:
-    """Return the lateral traction, for now 0 where it is that of an imprint; None: fitted, or due to friction."""
-    maps, my, mx = surfaces.surface.shape
-    if isinstance(lateral, str):
-        constant = not any(name.startswith(("layer.material", "sample.friction")) for name in parameters)
-        known = lateral == "imprint" and _presses(settings) and constant
-        return jnp.zeros((maps, 2, my, mx)) if known else None
-    return None if isinstance(lateral, AbstractPrior) else jnp.broadcast_to(lateral, (maps, 2, my, mx))
-
-
 def _near(run: _Run, imprinted: Imprinted, takes_lateral: bool) -> Objective:
     """Put the elastic foundation to rest at the imprints, and apply their lateral traction."""
     objective, palpation = run.objective, run.objective.palpation
@@ -318,9 +270,6 @@ def _fit_with_fallbacks(
     return reached
 
 
-_project_maps = QuickJit(jax.vmap(project_map, in_axes=(None, 0, 0, None)))
-
-
 def _draw(posterior: Posterior, key: PRNGKeyArray):
     """Draw deviations of unknowns, normal tractions [MPa] and interface [mm]; and degrees of freedom of the maps."""
     white, residuals, iterations = posterior.draw(key)
@@ -359,27 +308,14 @@ def _with_chosen_prior(run: _Run, reached: _Reached) -> _Reached:
     return reached
 
 
-def _missed(run: _Run, reached: _Reached, solutions: list[Solution]) -> tuple[Array, Array, Array]:
-    """Estimate the mesh error of every map: of the height (rms), and of the fitted normal traction and interface.
-
-    Returns:
-        Root mean square of the height's error [mm]; change of the normal traction [MPa] and of the interface [mm] that
-        the fit would make to follow it. All are 0 where the error cannot be estimated, or a `model_std` is given.
-    """
-    objective, nothing = run.objective, jax.tree.map(jnp.zeros_like, reached.residuals)
-    none = jnp.zeros(()), normal_traction(nothing), interface_displacement(nothing)
-    if run.settings.model_std is not None or not can_halve(objective.palpation.elements):
-        return none
-    run.bar.stage("mesh error", compiles=_COMPILES_HALF)
-    try:
-        errors = [mesh_error(one, objective.solver) for one in solutions]
-    except ConvergenceError:
-        return none
-    heights = interpolated(jnp.stack(errors), *objective.surfaces.surface.shape)
-    misfit = jax.vmap(lambda surface, change: surface.misfit_change(change))(objective.surfaces, heights)
-    change = {**nothing, "maps": misfit}
-    followed = plus(change, reached.posterior.solve(change).residual, -1.0)
-    return jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2)), normal_traction(followed), interface_displacement(followed)
+def _missed(run: _Run, reached: _Reached, solutions: list[Solution]) -> FollowedError:
+    """Estimate the mesh error; 0 where it cannot be estimated, or a `model_std` is given."""
+    if run.settings.model_std is None and can_halve(run.objective.palpation.elements):
+        run.bar.stage("mesh error", compiles=_COMPILES_HALF)
+        with suppress(ConvergenceError):
+            return followed_error(reached.posterior, run.objective, solutions)
+    nothing = jax.tree.map(jnp.zeros_like, reached.residuals)
+    return FollowedError(jnp.zeros(()), normal_traction(nothing), interface_displacement(nothing))
 
 
 def _result(reached: _Reached, run: _Run, several: bool) -> TractionFit:
