@@ -540,7 +540,8 @@ def test_a_map_that_contradicts_the_model_is_told(small):
     waves = 0.03 * jnp.cos(2.0 * jnp.pi * jnp.linspace(0.0, SIDE, 31) / 0.5)
     wavy = eqx.tree_at(lambda m: m.values, thickness := small_map(small), thickness.values + waves)
     with pytest.warns(UserWarning, match="cannot explain the map"):
-        fit = fit_along_z(experiment, wavy, prior, solver=settings, draws=1, progress=False)
+        # By the map's noise alone: waves of two elements would count as what the mesh cannot follow.
+        fit = fit_along_z(experiment, wavy, prior, model_std=0.0, solver=settings, draws=1, progress=False)
     assert fit.result == op.FitStatus.successful
     assert fit.reduced_chi2 > 5
 
