@@ -18,7 +18,8 @@ from ..solvers.compiling import QuickJit, is_traced
 from .conjugate_gradients import LeastSquares, Secants, dot, least_squares, plus
 from .line_search import ParabolicBacktracking, SearchState
 
-# Largest CG tolerance, far from the optimum.
+# Largest CG tolerance, far from the optimum. The coin's fit takes 159 CG iterations in 14 solves with 0.2, 191 in 13
+# with 0.03.
 _LARGEST_RTOL = 0.2
 # A Gauss–Newton direction changes the residuals by at most their norm; 1 % for inexact products. Secants without
 # the restart predicted up to 11 times that. Fits of friction and C10 take 13 to 29 forward solves, not 24 to 69.

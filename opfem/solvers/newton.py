@@ -40,8 +40,9 @@ class Newton(eqx.Module):
 
     Args:
         rtol: Unbalanced force over contact force [-] at convergence (Euclidean norms). The coin's map is within 2e-6
-            and its force within 1e-7 of a solve to 1e-9; half the increments change the map by 0.8 %. Tighten it to
-            1e-10 before comparing with finite differences.
+            and its force within 1e-7 of a solve to 1e-9; half the increments change the map by 0.8 %. Also the gap or
+            penetration that remains of hard contact, over the depth of an element. Tighten it to 1e-10 before
+            comparing with finite differences.
         increments: Load increments when none is cut.
         max_steps: Newton steps per increment before it is cut.
         min_increment: Smallest load increment [-]; the solve fails below it.
