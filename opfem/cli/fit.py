@@ -77,8 +77,9 @@ def fit(
                 solver=solver if steps.increments is None else dataclasses.replace(solver, increments=steps.increments),
                 draws=asked.draws,
             )
-        progress.stage("pictures")
+        progress.stage("summary")
         numbers = fit_summary(fitted, measured)
+        progress.stage("pictures")
         # Loaded here, so that a refused run does not wait for matplotlib.
         from ..plot import draw_fit
 

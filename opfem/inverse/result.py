@@ -18,6 +18,9 @@ from .uncertainty import Posterior, normal_covariance
 
 # A direction is unobserved if its posterior standard deviation is above this part of the prior one.
 _NOT_OBSERVED = 0.5
+# Observed without a linear system where the posterior draws give half of that part: chance of error at most 2 % with
+# 8 draws, 0.1 % with 16. On 28×16×2 elements the three systems take a quarter of the fit's time.
+_ENOUGH_DRAWS = 8
 # Bounds of χ² per degree of freedom outside of which `advice` names possible causes.
 _CHI2_BOUNDS = (0.5, 2.0)
 # Components of a direction below this part of the largest one are not named.
@@ -223,15 +226,19 @@ class TractionFit(eqx.Module):
         """
         found: dict[str, tuple[float, float]] = {}
         shape = self.posterior.white.normal.shape
+        drawn = self.deviations.reshape(-1, *shape)
+        # The null space of the prior has no prior standard deviation.
+        modes = {n: mode for n, mode in _MODES.items() if self.prior.mode_weight(shape[1:])[mode] == 1.0}
         for i in range(shape[0]):
-            for name, mode in _MODES.items():
+            for name, mode in modes.items():
                 weights = jnp.zeros(shape).at[i].set(_cosine(shape[1:], mode))
-                after = jnp.sqrt(jnp.sum(weights * normal_covariance(self.posterior, weights)))
                 before = _prior_std(self.objective, self.posterior.white, weights)
-                label = name if shape[0] == 1 else f"{name} of map {i}"
-                # The null space of the prior has no prior standard deviation.
-                penalised = self.prior.mode_weight(shape[1:])[mode] == 1.0
-                if penalised and after > _NOT_OBSERVED * before:
+                roughly = jnp.sqrt(jnp.mean(jnp.sum(weights * drawn, axis=(1, 2, 3)) ** 2))
+                if len(drawn) >= _ENOUGH_DRAWS and roughly < 0.5 * _NOT_OBSERVED * before:
+                    continue
+                after = jnp.sqrt(jnp.sum(weights * normal_covariance(self.posterior, weights)))
+                if after > _NOT_OBSERVED * before:
+                    label = name if shape[0] == 1 else f"{name} of map {i}"
                     found[label] = (float(after), float(before))
         if self.objective.parameters:
             variances, directions = np.linalg.eigh(np.asarray(self.number_covariance))
