@@ -66,6 +66,10 @@ class Increments(NamedTuple):
         none, no = jnp.zeros((), int), jnp.asarray(False)
         return cls((1.0 / settings.increments) * jnp.ones((), dtype), none, none, jnp.zeros((), dtype), no, no)
 
+    def is_cut(self, settings: Newton) -> Array:
+        """Return whether the next increment is smaller than an equal part of the load."""
+        return self.size * settings.increments < 0.999
+
     def ahead(self, fraction: Array) -> Array:
         """Compute the increment from a load fraction."""
         left = 1.0 - fraction
