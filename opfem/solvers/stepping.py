@@ -26,7 +26,6 @@ from .snap_through import SnapThrough
 from .solution import RESULTS
 from .tangent import Unknowns
 
-
 # Linear solves of an increment that was cut end at this part of `krylov_rtol`: with 3e-2 throughout, a layer of which
 # three quarters are lifted off fails at 85 % of its load (problem 108 of `benchmarks/robustness.py`).
 _CUT_KRYLOV = 1.0 / 3.0
