@@ -36,7 +36,7 @@ def choices() -> Choices:
 
 
 def memory() -> int | None:
-    """Return the memory of JAX's default device [byte]; None where it cannot be told."""
+    """Return the memory of JAX's default device [byte]; None where it is unknown."""
     device = jax.devices()[0]
     if device.platform != "cpu":
         return (device.memory_stats() or {}).get("bytes_limit")

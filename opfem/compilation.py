@@ -1,6 +1,6 @@
 """Compiled programs kept on disk, so that a new process does not compile them again.
 
-JAX writes and reads the entries; this module gives each kind of machine a folder of its own, bounds their size, and
+JAX writes and reads the entries; this module gives each kind of machine its own folder, bounds their size, and
 turns whatever goes wrong with them into a compilation and one line.
 """
 

@@ -26,7 +26,7 @@ def run_calibration(
     curves: list[str],
     out: Path,
     reading: CurveOptions,
-    asked: LawOptions,
+    options: LawOptions,
     run: RunOptions,
     files: PictureOptions = PictureOptions(),
 ) -> None:
@@ -36,7 +36,7 @@ def run_calibration(
         curves: Files of the curves.
         out: Folder of the results.
         reading: How to read the curves.
-        asked: What to fit.
+        options: What to fit.
         run: The run itself.
         files: Drawings to write, too.
     """
@@ -49,21 +49,21 @@ def run_calibration(
                 f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
             )
         columns = tuple(int(name) if name.lstrip("-").isdigit() else name for name in reading.columns)
-        options: dict[str, Any] = {**vars(reading), "columns": columns}
-        data = [read_stress_strain(path, **options) for path in curves]
+        columns_of: dict[str, Any] = {**vars(reading), "columns": columns}
+        data = [read_stress_strain(path, **columns_of) for path in curves]
         prepare(out)
         progress.stage("fit")
         found = calibrate(
             data,
-            asked.law,
-            bulk=asked.bulk_ratio,
-            offset=asked.offset != "none",
-            toe="strain" if asked.offset == "strain" else "stress",
-            terms=asked.terms,
-            weights=asked.weights,
-            range=asked.stretches,
-            platens=asked.platens,
-            diameter=asked.diameter,
+            options.law,
+            bulk=options.bulk_ratio,
+            offset=options.offset != "none",
+            toe="strain" if options.offset == "strain" else "stress",
+            terms=options.terms,
+            weights=options.weights,
+            range=options.stretches,
+            platens=options.platens,
+            diameter=options.diameter,
             height=reading.height,
         )
         progress.stage("pictures")

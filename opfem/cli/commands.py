@@ -1,4 +1,4 @@
-"""The commands: what each takes and does, as its help says it; each computes in a module of its own.
+"""The commands: what each takes and does, as its help says it; each computes in its own module.
 
 Those modules load JAX, so they are imported when a command runs.
 """
@@ -109,7 +109,7 @@ def fit(
     reading: MapOptions = MapOptions(),
     layer: FitLayerOptions = FitLayerOptions(),
     contact: ContactOptions = ContactOptions(),
-    asked: FitOptions = FitOptions(),
+    options: FitOptions = FitOptions(),
     steps: StepOptions = StepOptions(),
     files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
@@ -122,7 +122,7 @@ def fit(
     from .fit import fit
 
     with reporting(run.debug):
-        fit(map, out, reading, layer, contact, asked, steps, run, files)
+        fit(map, out, reading, layer, contact, options, steps, run, files)
 
 
 @app.command
@@ -184,7 +184,7 @@ def deck(
     info: Annotated[
         bool, Parameter(help="Solve nothing: say what the deck states, and draw it as deck.png in --out, where given.")
     ] = False,
-    asked: DeckOptions = DeckOptions(),
+    options: DeckOptions = DeckOptions(),
     files: ResultOptions = ResultOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
@@ -198,11 +198,11 @@ def deck(
 
     with reporting(run.debug):
         if info:
-            state_deck(file, out, asked, run)
+            state_deck(file, out, options, run)
         elif out is None:
             raise ValueError("--out is needed: folder of the results; or --info, which solves nothing.")
         else:
-            solve_deck(file, out, asked, run, files)
+            solve_deck(file, out, options, run, files)
 
 
 @app.command
@@ -223,7 +223,7 @@ def oct(
     ] = None,
     reading: VolumeOptions = VolumeOptions(),
     microscope: MicroscopeOptions = MicroscopeOptions(),
-    asked: InterfaceOptions = InterfaceOptions(),
+    options: InterfaceOptions = InterfaceOptions(),
     files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
@@ -242,7 +242,7 @@ def oct(
         if phase is not None:
             return measure_phase(phase, out, reading, microscope, run, files)
         assert loaded is not None
-        measure(loaded, out, unloaded, l0, reading, microscope, asked, run, files)
+        measure(loaded, out, unloaded, l0, reading, microscope, options, run, files)
 
 
 @app.command
@@ -252,7 +252,7 @@ def calibrate(
     ],
     out: _Out,
     reading: CurveOptions = CurveOptions(),
-    asked: LawOptions = LawOptions(),
+    options: LawOptions = LawOptions(),
     files: PictureOptions = PictureOptions(),
     run: RunOptions = RunOptions(),
 ) -> None:
@@ -263,7 +263,7 @@ def calibrate(
     from .calibrate import run_calibration
 
     with reporting(run.debug):
-        run_calibration(list(curves), out, reading, asked, run, files)
+        run_calibration(list(curves), out, reading, options, run, files)
 
 
 @app.command

@@ -29,29 +29,32 @@ INCREMENT = "axial_increment"
 _MOST_IGNORED = 40  # lines of --info
 
 
-def state_deck(file: Path, out: Path | None, asked: DeckOptions, run: RunOptions) -> None:
+def state_deck(file: Path, out: Path | None, options: DeckOptions, run: RunOptions) -> None:
     """Print what a deck states and what of it is ignored; draw it.
 
     Args:
         file: The deck.
         out: Folder of the picture; None draws none.
-        asked: How it is taken.
+        options: How it is taken.
         run: The run itself.
 
     Raises:
         DeckError: At the end, if it is no problem for opfem.
     """
     configure_jax(run.no_cache)
-    deck = read_inp(file, code=asked.code)
+    deck = read_inp(file, code=options.code)
     bodies = find_bodies(deck)
     console = Console(highlight=False)
     console.print(_table(deck, bodies))
     refused: DeckError | None = None
     loads: tuple[Any, ...] = ()
     try:
-        experiment, loads = deck.experiment(asked.bulk, asked.layer), deck.loads(asked.interpolation, asked.layer)
+        experiment, loads = (
+            deck.experiment(options.bulk, options.layer),
+            deck.loads(options.interpolation, options.layer),
+        )
         console.print(f"opfem takes it as {_words(experiment, loads, deck)}", markup=False, soft_wrap=True)
-        for said in deck.assumed(asked.bulk, asked.layer):
+        for said in deck.assumed(options.bulk, options.layer):
             console.print(f"  {said}", markup=False, soft_wrap=True)
     except DeckError as cause:
         refused = cause
@@ -131,14 +134,14 @@ def _picture(deck: Deck, bodies: list[Body], loads: tuple[Any, ...]) -> bytes:
 
 
 def solve_deck(
-    file: Path, out: Path, asked: DeckOptions, run: RunOptions, files: ResultOptions = ResultOptions()
+    file: Path, out: Path, options: DeckOptions, run: RunOptions, files: ResultOptions = ResultOptions()
 ) -> None:
     """Solve all steps of a deck and write them, the last one last.
 
     Args:
         file: The deck.
         out: Folder of the results.
-        asked: How it is taken.
+        options: How it is taken.
         run: The run itself.
         files: Files for other programs, to write too.
     """
@@ -146,11 +149,14 @@ def solve_deck(
         progress.stage("reading")
         configure_jax(run.no_cache)
         settle(out, run.force)
-        deck = read_inp(file, code=asked.code)
-        experiment, loads = deck.experiment(asked.bulk, asked.layer), deck.loads(asked.interpolation, asked.layer)
-        solver = _solver(deck, asked)
+        deck = read_inp(file, code=options.code)
+        experiment, loads = (
+            deck.experiment(options.bulk, options.layer),
+            deck.loads(options.interpolation, options.layer),
+        )
+        solver = _solver(deck, options)
         prepare(out)
-    assumed = deck.assumed(asked.bulk, asked.layer)
+    assumed = deck.assumed(options.bulk, options.layer)
     console = Console(highlight=False)
     console.print(f"Solving {deck.name}: {_words(experiment, loads, deck)}", markup=False, soft_wrap=True)
     for said in assumed:
@@ -176,20 +182,20 @@ def solve_deck(
         console.print(f"Wrote {', '.join(written)} to {folder}", markup=False, soft_wrap=True)
 
 
-def _solver(deck: Deck, asked: DeckOptions) -> Newton | Explicit:
+def _solver(deck: Deck, options: DeckOptions) -> Newton | Explicit:
     own = deck.solver()
-    if asked.solver == "deck" and asked.increments is None and asked.precision == "float64":
+    if options.solver == "deck" and options.increments is None and options.precision == "float64":
         return own
-    explicit = isinstance(own, Explicit) if asked.solver == "deck" else asked.solver == "explicit"
+    explicit = isinstance(own, Explicit) if options.solver == "deck" else options.solver == "explicit"
     if explicit:
-        if asked.increments is not None:
+        if options.increments is not None:
             raise ValueError("--increments needs implicit statics: --solver newton.")
         solver = own if isinstance(own, Explicit) else Explicit()
-        return dataclasses.replace(solver, precision="float32") if asked.precision == "float32" else solver
-    if asked.precision == "float32":
+        return dataclasses.replace(solver, precision="float32") if options.precision == "float32" else solver
+    if options.precision == "float32":
         raise ValueError("--precision float32 needs --solver explicit.")
-    if asked.increments is not None:
-        return Newton(increments=asked.increments)
+    if options.increments is not None:
+        return Newton(increments=options.increments)
     return own if isinstance(own, Newton) else Newton()
 
 
@@ -222,7 +228,7 @@ def _write(
             spacing = np.asarray(solution.experiment.extent) / solution.experiment.layer_elements[:2]
             figures = draw_simulation(dataset, measured_thickness(solution, spacing))
         progress.stage("writing")
-        return write_result(dataset, figures, numbers, folder, asked=files)  # nothing of a deck is measured
+        return write_result(dataset, figures, numbers, folder, options=files)  # nothing of a deck is measured
 
 
 def axial_increment(solution: Solution | ExperimentSolution, before: Solution | ExperimentSolution) -> xr.DataArray:

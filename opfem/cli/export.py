@@ -12,36 +12,36 @@ from .deck_options import WriteOptions
 Problem = TypeVar("Problem", Palpation, Experiment)
 
 
-def with_linear_contact(problem: Problem, asked: WriteOptions) -> Problem:
+def with_linear_contact(problem: Problem, options: WriteOptions) -> Problem:
     """Replace contact laws by the linear one that CalculiX has, where that is asked for."""
-    if asked.contact_stiffness is None:
-        if asked.stick_slope is not None:
+    if options.contact_stiffness is None:
+        if options.stick_slope is not None:
             raise ValueError("--stick-slope needs --contact-stiffness: the linear contact that it belongs to.")
         return problem
-    law = LinearOverclosure(asked.contact_stiffness)
+    law = LinearOverclosure(options.contact_stiffness)
     names = ("window", "sample") if isinstance(problem, Palpation) else ("window", "interface", "plate")
     sides = {name: getattr(problem, name) for name in names}
     changed = {
-        name: Contact(law, side.friction, stick_slope=asked.stick_slope)
+        name: Contact(law, side.friction, stick_slope=options.stick_slope)
         for name, side in sides.items()
         if isinstance(side, Contact)
     }
     return dataclasses.replace(problem, **changed)
 
 
-def linear_settings(asked: WriteOptions) -> dict[str, float]:
+def linear_settings(options: WriteOptions) -> dict[str, float]:
     """Collect what was asked of the contact, for summary.json."""
-    given = {"contact_stiffness": asked.contact_stiffness, "stick_slope": asked.stick_slope}
+    given = {"contact_stiffness": options.contact_stiffness, "stick_slope": options.stick_slope}
     return {name: value for name, value in given.items() if value is not None}
 
 
-def export(problem: Palpation | Experiment, load: Any, solver: Any, asked: WriteOptions) -> None:
+def export(problem: Palpation | Experiment, load: Any, solver: Any, options: WriteOptions) -> None:
     """Write the deck, where one is asked for.
 
     Raises:
         ValueError: If the code cannot say the problem exactly.
     """
-    if asked.write_inp is None:
+    if options.write_inp is None:
         return
-    write_inp(asked.write_inp, problem, load, solver, code=asked.code)
-    Console(highlight=False).print(f"Wrote {asked.write_inp} for {asked.code}", markup=False, soft_wrap=True)
+    write_inp(options.write_inp, problem, load, solver, code=options.code)
+    Console(highlight=False).print(f"Wrote {options.write_inp} for {options.code}", markup=False, soft_wrap=True)

@@ -29,7 +29,7 @@ def fit(
     reading: MapOptions,
     layer: LayerOptions,
     contact: ContactOptions,
-    asked: FitOptions,
+    options: FitOptions,
     steps: StepOptions,
     run: RunOptions,
     files: ResultOptions = ResultOptions(),
@@ -42,7 +42,7 @@ def fit(
         reading: How to read the maps.
         layer: The layer and its mesh.
         contact: Contact with window and sample.
-        asked: The fit.
+        options: The fit.
         steps: How the load is applied.
         run: The run itself.
         files: Files for other programs, to write too.
@@ -55,8 +55,8 @@ def fit(
         if measured.std is None:
             raise ValueError("--std [mm] is needed: the standard deviation of the thickness noise, a positive number.")
         palpation, filled = state_experiment(measured, unloaded, reading, layer, contact)
-        prior = state_prior(palpation, filled, asked)
-        settings = {**settings_of(map, reading, layer, contact, filled), **_asked(asked, prior)}
+        prior = state_prior(palpation, filled, options)
+        settings = {**settings_of(map, reading, layer, contact, filled), **_options_used(options, prior)}
         prepare(out)
         show_assumptions(palpation, measured, layer)
         Console(highlight=False).print(
@@ -70,12 +70,12 @@ def fit(
                 palpation,
                 measured,
                 prior,
-                parameters=_parameters(palpation, asked),
-                nonnegative=asked.nonnegative,
-                model_std=asked.model_std,
-                hyperparameters=asked.hyperparameters,
+                parameters=_parameters(palpation, options),
+                nonnegative=options.nonnegative,
+                model_std=options.model_std,
+                hyperparameters=options.hyperparameters,
                 solver=solver if steps.increments is None else dataclasses.replace(solver, increments=steps.increments),
-                draws=asked.draws,
+                draws=options.draws,
             )
         progress.stage("summary")
         numbers = fit_summary(fitted, measured)
@@ -89,24 +89,24 @@ def fit(
         progress.stage("writing")
         example = {EXAMPLE: measured} if map == "example" else {}
         numbers["settings"] = settings
-        written = write_result(dataset, figures, numbers, out, example, measured=measured, asked=files)
+        written = write_result(dataset, figures, numbers, out, example, measured=measured, options=files)
     _show(numbers, written, out)
 
 
-def state_prior(palpation: Palpation, filled: ThicknessMap, asked: FitOptions) -> Matern:
+def state_prior(palpation: Palpation, filled: ThicknessMap, options: FitOptions) -> Matern:
     """State what is known of the pressure; what was not given comes from the uniaxial estimate.
 
     Args:
         palpation: The experiment.
         filled: Loaded thickness without missing pixels.
-        asked: What was given.
+        options: What was given.
     """
     pressure = uniaxial_estimate(palpation, filled)
     size = float(jnp.max(jnp.stack(palpation.mesh().spacing)))
     return Matern(
-        length=_ELEMENTS_PER_LENGTH * size if asked.prior_length is None else asked.prior_length,
-        std=jnp.std(pressure) if asked.prior_std is None else asked.prior_std,
-        mean=jnp.mean(pressure) if asked.prior_mean is None else asked.prior_mean,
+        length=_ELEMENTS_PER_LENGTH * size if options.prior_length is None else options.prior_length,
+        std=jnp.std(pressure) if options.prior_std is None else options.prior_std,
+        mean=jnp.mean(pressure) if options.prior_mean is None else options.prior_mean,
     )
 
 
@@ -145,23 +145,23 @@ def fit_summary(fitted: TractionFit, measured: ThicknessMap) -> dict[str, Any]:
     }
 
 
-def _parameters(palpation: Palpation, asked: FitOptions) -> dict[str, LogNormal]:
+def _parameters(palpation: Palpation, options: FitOptions) -> dict[str, LogNormal]:
     window, sample, material = palpation.window, palpation.sample, palpation.layer.material
     # As `state_experiment` states them.
     assert isinstance(window, Contact)
     assert isinstance(sample, Contact)
     assert isinstance(material, MooneyRivlin)
     known = {
-        "window.friction": (window.friction, asked.friction_spread),
-        "sample.friction": (sample.friction, asked.friction_spread),
-        "layer.material.c10": (material.c10, asked.modulus_spread),
+        "window.friction": (window.friction, options.friction_spread),
+        "sample.friction": (sample.friction, options.friction_spread),
+        "layer.material.c10": (material.c10, options.modulus_spread),
     }
     return {name: LogNormal(median, spread) for name, (median, spread) in known.items() if spread is not None}
 
 
-def _asked(asked: FitOptions, prior: Matern) -> dict[str, Any]:
+def _options_used(options: FitOptions, prior: Matern) -> dict[str, Any]:
     used = {name: float(getattr(prior, name)) for name in ("length", "std", "mean")}
-    return {**dataclasses.asdict(asked), **{f"prior_{name}": value for name, value in used.items()}}
+    return {**dataclasses.asdict(options), **{f"prior_{name}": value for name, value in used.items()}}
 
 
 def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
@@ -199,5 +199,5 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
     for name, part in numbers["not_identified_within_25_percent"].items():
         console.print(f"The data tell {name} to {100 * part:.0f} % only.", style="yellow")
     for name, (after, before) in numbers["not_observed"].items():
-        console.print(f"The map hardly tells: {name} ({after:.3g} after, {before:.3g} before the fit).", style="yellow")
+        console.print(f"The map does not determine: {name} ({after:.3g} after, {before:.3g} before).", style="yellow")
     console.print(f"Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)

@@ -80,7 +80,7 @@ def write_result(
     maps: Mapping[str, ThicknessMap] = MappingProxyType({}),
     *,
     measured: ThicknessMap | None = None,
-    asked: ResultOptions = ResultOptions(),
+    options: ResultOptions = ResultOptions(),
 ) -> list[str]:
     """Write every file of a result: all are complete before one of an old result is replaced.
 
@@ -91,14 +91,14 @@ def write_result(
         out: Folder of the results.
         maps: Thickness maps by file name: the built-in one where that was measured, or those that were simulated.
         measured: Measured map, whose pixels exported maps have; None takes those of the load.
-        asked: Which files for other programs are written, too.
+        options: Which files for other programs are written too.
 
     Returns:
         The names of the files.
     """
     contents: dict[str, Any] = {name: _thickness_bytes(thickness) for name, thickness in maps.items()}
     contents["result.vtu"] = vtu_bytes(dataset)
-    contents |= exports(dataset, measured, asked) | pictures(figures, asked)
+    contents |= exports(dataset, measured, options) | pictures(figures, options)
     contents["summary.json"] = _json(numbers)
     contents[FINISHED] = netcdf_bytes(dataset)
     write_together(out, contents, RESULT)

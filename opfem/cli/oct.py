@@ -37,7 +37,7 @@ def measure(
     l0: float | None,
     reading: VolumeOptions,
     microscope: MicroscopeOptions,
-    asked: InterfaceOptions,
+    options: InterfaceOptions,
     run: RunOptions,
     files: PictureOptions = PictureOptions(),
 ) -> None:
@@ -50,7 +50,7 @@ def measure(
         l0: Unloaded thickness [mm].
         reading: How to read the volumes.
         microscope: The microscope.
-        asked: What to look for.
+        options: What to look for.
         run: The run itself.
         files: Drawings to write, too.
     """
@@ -68,12 +68,12 @@ def measure(
         before = None if unloaded is None else read_volume(unloaded, reading)
         prepare(out)
         progress.stage("interface")
-        interface, thickness = find_thickness(volume, loaded, microscope, asked)
-        first = None if before is None else find_thickness(before, str(unloaded), microscope, asked)[1]
+        interface, thickness = find_thickness(volume, loaded, microscope, options)
+        first = None if before is None else find_thickness(before, str(unloaded), microscope, options)[1]
         if first is not None and first.shape != thickness.shape:
             raise ValueError(f"--unloaded has (ny, nx) = {first.shape} A-lines, LOADED {thickness.shape}.")
         numbers = _numbers(loaded, volume, interface, thickness, first if first is not None else l0)
-        stated = {**dataclasses.asdict(reading), **dataclasses.asdict(microscope), **dataclasses.asdict(asked)}
+        stated = {**dataclasses.asdict(reading), **dataclasses.asdict(microscope), **dataclasses.asdict(options)}
         numbers["settings"] = {name: value for name, value in stated.items() if value is not None}
         progress.stage("pictures")
         from ..plot import draw_interface
@@ -102,7 +102,7 @@ def find_thickness(
     volume: OctVolume,
     path: str,
     microscope: MicroscopeOptions = MicroscopeOptions(),
-    asked: InterfaceOptions = InterfaceOptions(),
+    options: InterfaceOptions = InterfaceOptions(),
 ) -> tuple[Interface, ThicknessMap]:
     """Find the interface and the thickness by the options of the command line.
 
@@ -110,29 +110,29 @@ def find_thickness(
         volume: The volume.
         path: Its file, for messages.
         microscope: The microscope.
-        asked: What to look for.
+        options: What to look for.
 
     Raises:
         MeasurementError: Where there is no interface; names the file.
     """
     system = OctSystem(**dataclasses.asdict(microscope))
-    mask = None if asked.mask is None else read_mask(Path(path), asked.mask, volume.shape[:2], MAX_BYTES)
+    mask = None if options.mask is None else read_mask(Path(path), options.mask, volume.shape[:2], MAX_BYTES)
     find: dict[str, Any] = {
-        "edge": asked.edge,
-        "max_slope": asked.max_slope,
-        "average": asked.average,
-        "confidence": asked.confidence,
+        "edge": options.edge,
+        "max_slope": options.max_slope,
+        "average": options.average,
+        "confidence": options.confidence,
         "mask": mask,
     }
-    low, high = asked.search or (0.03, None)
+    low, high = options.search or (0.03, None)
     try:
-        if asked.window == "first_pixel":
+        if options.window == "first_pixel":
             interface = find_interface(volume, system, search=(low, high), **find)
-            return interface, interface.thickness(tilt=asked.tilt)
+            return interface, interface.thickness(tilt=options.tilt)
         window = find_interface(volume, system, edge="peak", search=(0.0, high), mask=mask)
         below = (np.asarray(window.depth) + max(low, _WINDOW_REACH), high)
         interface = find_interface(volume, system, search=below, **find)
-        return interface, interface.thickness(window, asked.tilt)
+        return interface, interface.thickness(window, options.tilt)
     except MeasurementError as cause:
         raise MeasurementError(f"{path}: {cause}") from cause
 
@@ -182,12 +182,12 @@ def _show(numbers: dict[str, Any], files: list[str], out: Path) -> None:
 
 
 def _interface_bytes(interface: Interface) -> bytes:
-    held = io.BytesIO()
+    buffer = io.BytesIO()
     fields = {
         name: np.asarray(getattr(interface, name)) for name in ("depth", "std", "confidence", "contrast_db", "edge")
     }
-    np.savez_compressed(held, edges=np.array(EDGES), mask=np.asarray(interface.mask), **fields)  # pyright: ignore[reportArgumentType]
-    return held.getvalue()
+    np.savez_compressed(buffer, edges=np.array(EDGES), mask=np.asarray(interface.mask), **fields)  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
 
 
 def _map_bytes(thickness: ThicknessMap) -> bytes:

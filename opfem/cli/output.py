@@ -23,14 +23,14 @@ def with_drawings(names: Sequence[str]) -> tuple[str, ...]:
     return (*drawings, *names)
 
 
-def pictures(figures: Mapping[str, Any], asked: PictureOptions) -> dict[str, bytes]:
+def pictures(figures: Mapping[str, Any], options: PictureOptions) -> dict[str, bytes]:
     """Encode pictures, optionally as vector drawings too.
 
     Args:
         figures: Matplotlib figures by file name, which ends in .png.
-        asked: Which drawings.
+        options: Which drawings.
     """
-    wanted = [".png", *(suffix for suffix in _DRAWINGS if getattr(asked, suffix[1:]))]
+    wanted = [".png", *(suffix for suffix in _DRAWINGS if getattr(options, suffix[1:]))]
     contents = {}
     for name, figure in figures.items():
         for suffix in wanted:
@@ -40,16 +40,16 @@ def pictures(figures: Mapping[str, Any], asked: PictureOptions) -> dict[str, byt
     return contents
 
 
-def exports(dataset: xr.Dataset, measured: ThicknessMap | None, asked: ResultOptions) -> dict[str, bytes]:
+def exports(dataset: xr.Dataset, measured: ThicknessMap | None, options: ResultOptions) -> dict[str, bytes]:
     """Encode a result for browsers and the maps for other programs, by file name.
 
     Args:
         dataset: What was solved or fitted.
         measured: Measured map, whose pixels are taken; None takes those of the load.
-        asked: Which of them.
+        options: Which of them.
     """
-    files = {f"result{MAP_FILES[kind][0]}": encoded(dataset, kind, measured) for kind in dict.fromkeys(asked.also)}
-    if not asked.report:
+    files = {f"result{MAP_FILES[kind][0]}": encoded(dataset, kind, measured) for kind in dict.fromkeys(options.also)}
+    if not options.report:
         return files
     # Loaded here, so that what needs no report does not wait for plotly.
     from ..report import report_bytes

@@ -114,7 +114,7 @@ def write_results(
         figures = draw_pictures(dataset, measured)
         progress.stage("writing")
         maps = {EXAMPLE: measured} if is_example else {}
-        return write_result(dataset, figures, numbers, out, maps, measured=measured, asked=files)
+        return write_result(dataset, figures, numbers, out, maps, measured=measured, options=files)
 
 
 def _solver(options: SolverOptions) -> Newton | Explicit:

@@ -89,7 +89,7 @@ def _numbers(found: DisplacementVolume) -> dict[str, Any]:
 
 
 def _bytes(found: DisplacementVolume) -> bytes:
-    held = io.BytesIO()
+    buffer = io.BytesIO()
     fields = {
         name: np.asarray(getattr(found, name))
         for name in (
@@ -104,5 +104,5 @@ def _bytes(found: DisplacementVolume) -> bytes:
             "axial_noise",
         )
     }
-    np.savez_compressed(held, mask=found.mask, **fields)  # pyright: ignore[reportArgumentType]
-    return held.getvalue()
+    np.savez_compressed(buffer, mask=found.mask, **fields)  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()

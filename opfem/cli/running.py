@@ -48,7 +48,7 @@ def reporting(debug: bool) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except Exception as cause:
-        if interrupts:  # what was interrupted may turn that into an error of its own
+        if interrupts:  # what was interrupted may turn that into its own error
             _end_interrupted()
         if debug:
             raise

@@ -68,7 +68,7 @@ def simulate(
         if isinstance(scene.experiment.layer.thickness, ThicknessMap):
             maps[UNLOADED] = _unloaded(truth, measured)
         progress.stage("writing")
-        written = write_result(dataset, figures, numbers, out, maps, measured=measured, asked=files)
+        written = write_result(dataset, figures, numbers, out, maps, measured=measured, options=files)
     _show_results(truth, numbers, written, out)
 
 
@@ -112,7 +112,7 @@ def _show_results(truth: ExperimentSolution, numbers: dict[str, Any], files: lis
 
 
 def _options(experiment: Experiment, out: Path) -> str:
-    """Write the options that tell `opfem palpate` of the same layer."""
+    """Write the options of `opfem palpate` for the same layer."""
     thickness, law = experiment.layer.thickness, experiment.layer.material
     unloaded = out / UNLOADED if isinstance(thickness, ThicknessMap) else f"{float(thickness):g}"
     options = f"--l0 {unloaded}"

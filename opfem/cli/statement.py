@@ -112,7 +112,7 @@ def _read(path: str, **how: Any) -> ThicknessMap:
             raise ValueError(
                 f"{path} is an OCT volume and knows its grid and noise; leave out {options}, or use opfem oct."
             )
-        return find_thickness(read_volume(path), path, asked=InterfaceOptions(mask=how.get("mask")))[1]
+        return find_thickness(read_volume(path), path, options=InterfaceOptions(mask=how.get("mask")))[1]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", MeasurementWarning)
         read = read_thickness(path, **how)

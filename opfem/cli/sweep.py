@@ -1,6 +1,6 @@
 """`opfem sweep CONFIG.toml`: a sweep of solves stated in a file.
 
-The file says what `opfem palpate` would be told, which of its numbers vary, and what to keep.
+The file states the options of `opfem palpate`, which of its numbers vary, and what to keep.
 """
 
 import dataclasses

@@ -51,7 +51,7 @@ class Section:
 
 @dataclass
 class Part:
-    """Nodes and elements in a frame of their own; the only one of a deck without *PART has the name "".
+    """Nodes and elements in their own frame; the only one of a deck without *PART has the name "".
 
     Attributes:
         numbers: Of the nodes `(n,)`.

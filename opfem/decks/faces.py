@@ -1,4 +1,4 @@
-"""What a deck does to the faces of a soft block: rigid surfaces in contact, nodes held, sides, springs and pins."""
+"""What a deck does to the faces of a soft block: rigid surfaces, constrained nodes, sides, springs, pins."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -38,11 +38,11 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A face whose own nodes are held, or free.
+class Constrained:
+    """A face whose own nodes are constrained, or free.
 
     Attributes:
-        lateral: Whether x and y are held at zero.
+        lateral: Whether x and y are constrained at zero.
         uz: Displacement along z at the end of every step `(steps, my, mx)` [mm]; None where free.
         rest: Heights in the deck [mm] `(my, mx)`.
     """
@@ -52,7 +52,7 @@ class Held:
     rest: np.ndarray
 
 
-End = Surface | Held
+End = Surface | Constrained
 
 
 class Touching(NamedTuple):
@@ -125,12 +125,12 @@ class Supports:
         low: Its lower face.
         high: Its upper face.
         sides: "free" or "roller" of x0, x1, y0, y1.
-        pins: In-plane directions of single nodes that are held besides.
+        pins: In-plane directions of single nodes that are constrained besides.
         hold: Stiffness of springs to ground [N/mm], in total; 0 without.
     """
 
-    low: Held
-    high: Held
+    low: Constrained
+    high: Constrained
     sides: tuple[str, str, str, str]
     pins: int
     hold: float
@@ -140,14 +140,14 @@ def supports(block: Block, deck: Deck) -> Supports:
     """Find what holds a block, and refuse what opfem cannot hold so.
 
     Raises:
-        DeckError: If nodes are held that are no whole face, or held otherwise.
+        DeckError: If nodes are constrained that are no whole face, or constrained otherwise.
     """
     body = block.body
     moved = displacements(body, deck)[:, block.nodes]  # steps, z, y, x, component
-    held = ~np.isnan(moved)
-    if held.shape[0] and np.any(held != held[0]):
-        raise body.place.refuse(f"{body.name} is held in some steps only; opfem holds it in all.")
-    mask = held[0] if len(held) else np.zeros((*block.nodes.shape, 3), bool)
+    constrained = ~np.isnan(moved)
+    if constrained.shape[0] and np.any(constrained != constrained[0]):
+        raise body.place.refuse(f"{body.name} is constrained in some steps only; opfem constrains it in all.")
+    mask = constrained[0] if len(constrained) else np.zeros((*block.nodes.shape, 3), bool)
     if np.abs(np.nan_to_num(moved[..., :2])).max(initial=0.0) > _STILL:
         raise body.place.refuse(f"nodes of {body.name} are moved sideways; opfem moves them along z only.")
     explained = np.zeros_like(mask)
@@ -160,7 +160,7 @@ def supports(block: Block, deck: Deck) -> Supports:
             explained[side, ..., :2] = True
         if normal:
             explained[side, ..., 2] = True
-        ends[side] = Held(bool(lateral), moved[:, side, :, :, 2] if normal else None, block.z[side])
+        ends[side] = Constrained(bool(lateral), moved[:, side, :, :, 2] if normal else None, block.z[side])
     sides = []
     for component, at in ((0, 0), (0, -1), (1, 0), (1, -1)):
         all_of = slice(None)
@@ -174,7 +174,7 @@ def supports(block: Block, deck: Deck) -> Supports:
         level, row, column, component = np.argwhere(rest)[0]
         number = body.numbers[block.nodes[level, row, column]]
         raise body.place.refuse(
-            f"{int(rest.sum())} displacements of {body.name} are held that are no whole face of it, such as "
+            f"{int(rest.sum())} displacements of {body.name} are constrained that are no whole face of it, such as "
             f"{'xyz'[component]} of node {number}. opfem holds faces: bonded, roller, or in contact."
         )
     x0, x1, y0, y1 = sides

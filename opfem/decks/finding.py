@@ -8,7 +8,7 @@ import numpy as np
 from .bodies import SAME, Block, find_bodies
 from .cards import Place
 from .deck import Deck
-from .faces import Held, Surface, Touching, is_flat, rigid_surface, supports, touching
+from .faces import Constrained, Surface, Touching, is_flat, rigid_surface, supports, touching
 from .laws import contact_of, is_soft
 from .problem import HINT, Problem
 
@@ -47,10 +47,10 @@ def _of_one(deck: Deck, block: Block, surfaces: dict[int, Surface]) -> Problem:
     """Tell window and sample apart: the window is flat and at rest; the lower one, where both are."""
     size = float(np.ptp(block.body.X, axis=0).max())
 
-    def can_be_window(side: int, held: Held) -> bool:
+    def can_be_window(side: int, face: Constrained) -> bool:
         surface = surfaces.get(side)
         if surface is None:
-            return held.uz is not None and is_flat(held.rest, size) and not np.any(held.uz)
+            return face.uz is not None and is_flat(face.rest, size) and not np.any(face.uz)
         heights = np.concatenate([surface.rest[None], surface.heights])
         return is_flat(heights, size) and float(np.ptp(heights)) <= SAME * size
 
@@ -61,16 +61,16 @@ def _of_one(deck: Deck, block: Block, surfaces: dict[int, Surface]) -> Problem:
     if can_be_window(-1, found.high):
         return Problem(deck, block.flipped(), None, True, high, None, low)
     raise block.body.place.refuse(
-        f"neither the lower nor the upper face of {block.body.name} has a window: a plane at rest, in contact or held. "
-        + HINT
+        f"neither the lower nor the upper face of {block.body.name} has a window: a plane at rest, in contact "
+        "or constrained. " + HINT
     )
 
 
-def _end(surface: Surface | None, held: Held) -> Surface | Held:
-    """Take what a face is in contact with, or how its nodes are held; not both."""
-    if surface is not None and held.uz is not None:
-        raise surface.place.refuse("*CONTACT PAIR: nodes of a face in contact are held along z besides.")
-    return held if surface is None else surface
+def _end(surface: Surface | None, face: Constrained) -> Surface | Constrained:
+    """Take what a face is in contact with, or how its nodes are constrained; not both."""
+    if surface is not None and face.uz is not None:
+        raise surface.place.refuse("*CONTACT PAIR: nodes of a face in contact are constrained along z besides.")
+    return face if surface is None else surface
 
 
 def _of_two(deck: Deck, blocks: list[Block], at: dict[tuple[int, int], Touching], layer: str | None) -> Problem:
@@ -90,14 +90,16 @@ def _of_two(deck: Deck, blocks: list[Block], at: dict[tuple[int, int], Touching]
         raise start.refuse(f"there is no *CONTACT PAIR between {' and '.join(names)}, the layer and the sample.")
     ends = []
     for number, side in ((own, outer), (sample, inner)):
-        held = supports(blocks[number], deck)
+        support = supports(blocks[number], deck)
         found = at.get((number, side))
         if found is not None and found.other in (lower.body, upper.body):
             raise found.pair.place.refuse("*CONTACT PAIR: layer and sample touch at one face only.")
         surface = None if found is None else rigid_surface(found, deck)
-        ends.append(_end(surface, held.low if side == 0 else held.high))
-        if (held.high if side == 0 else held.low).uz is not None:
-            raise between.pair.place.refuse("*CONTACT PAIR: nodes of a face in contact are held along z besides.")
+        ends.append(_end(surface, support.low if side == 0 else support.high))
+        if (support.high if side == 0 else support.low).uz is not None:
+            raise between.pair.place.refuse(
+                "*CONTACT PAIR: nodes of a face in contact are constrained along z besides."
+            )
     contact = contact_of(deck.interactions[between.pair.interaction], deck)
     layer_block, sample_block = blocks[own], blocks[sample]
     if is_flipped:

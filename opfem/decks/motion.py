@@ -1,4 +1,4 @@
-"""Where the nodes of a body are held at the end of every step: conditions, amplitudes and steps put together."""
+"""Where the nodes of a body are constrained at the end of every step: conditions, amplitudes and steps put together."""
 
 import numpy as np
 
@@ -15,25 +15,25 @@ def displacements(body: Body, deck: Deck) -> np.ndarray:
     Raises:
         DeckError: If an explicit step has a displacement without amplitude.
     """
-    held = np.full((len(body.numbers), 3), np.nan)
+    constrained = np.full((len(body.numbers), 3), np.nan)
     for condition in deck.prescribed:
-        _apply(condition, body, held, _factor(condition, deck, 0.0))
+        _apply(condition, body, constrained, _factor(condition, deck, 0.0))
     ends, before = [], 0.0
     for step in deck.steps:
-        begin = held.copy()
+        begin = constrained.copy()
         if step.is_new:
-            held = np.full_like(held, np.nan)
+            constrained = np.full_like(constrained, np.nan)
         for condition in step.prescribed:
             if step.kind == "static":
-                _apply(condition, body, held, _factor(condition, deck, before + step.time, step.time))
+                _apply(condition, body, constrained, _factor(condition, deck, before + step.time, step.time))
             else:
-                change = np.full_like(held, np.nan)
+                change = np.full_like(constrained, np.nan)
                 _apply(condition, body, change, _change(condition, deck, before, step))
                 moved = ~np.isnan(change)
-                held[moved] = np.where(np.isnan(begin), 0.0, begin)[moved] + change[moved]
+                constrained[moved] = np.where(np.isnan(begin), 0.0, begin)[moved] + change[moved]
         before += step.time
-        ends.append(held.copy())
-    return np.array(ends).reshape(len(deck.steps), *held.shape)
+        ends.append(constrained.copy())
+    return np.array(ends).reshape(len(deck.steps), *constrained.shape)
 
 
 def forces(body: Body, deck: Deck) -> np.ndarray:
@@ -47,12 +47,12 @@ def forces(body: Body, deck: Deck) -> np.ndarray:
     return np.array(ends).reshape(len(deck.steps), *acting.shape)
 
 
-def _apply(condition: Condition, body: Body, held: np.ndarray, factor: float) -> None:
+def _apply(condition: Condition, body: Body, constrained: np.ndarray, factor: float) -> None:
     if condition.instance != body.instance:
         return
     at = np.minimum(np.searchsorted(body.numbers, condition.nodes), body.numbers.size - 1)
     own = body.numbers[at] == condition.nodes
-    held[at[own], condition.component] = factor * condition.values[own]
+    constrained[at[own], condition.component] = factor * condition.values[own]
 
 
 def _factor(condition: Condition, deck: Deck, total: float, time: float | None = None) -> float:

@@ -34,7 +34,7 @@ from ..model.surface import Interpolation
 from .bodies import SAME, Block
 from .cards import DeckError
 from .deck import Deck
-from .faces import Held, Supports, Surface, is_flat, supports
+from .faces import Constrained, Supports, Surface, is_flat, supports
 from .laws import contact_of, element_of, law_of, said_of_bulk, zero_d
 from .motion import forces
 
@@ -61,9 +61,9 @@ class Problem:
     layer: Block
     sample: Block | None
     is_flipped: bool
-    window: Surface | Held
+    window: Surface | Constrained
     interface: Contact | None
-    top: Surface | Held
+    top: Surface | Constrained
 
     @property
     def sign(self) -> float:
@@ -110,7 +110,7 @@ class Problem:
 
     def experiment(self, bulk: float | None) -> Palpation | Experiment:
         """Build the palpation or the experiment."""
-        held = supports(self.layer, self.deck)
+        support = supports(self.layer, self.deck)
         element = cast(Element, element_of(self.layer.body, self.deck))
         materials = set(self.layer.body.material.tolist())
         if len(materials) > 1:
@@ -120,20 +120,20 @@ class Problem:
         law = law_of(self.deck.materials[materials.pop()], self.deck, element, bulk)
         nx, ny, nz = self.layer.counts
         window = self._side(self.window)
-        hold = self._hold(held, law)
+        hold = self._hold(support, law)
         try:
             layer = Layer(_map(self.heights[-1], self.extent, self.size), law)
             if self.sample is None:
                 return Palpation(
-                    layer, self.extent, (nx, ny, nz), window, self._side(self.top), held.sides, element, hold
+                    layer, self.extent, (nx, ny, nz), window, self._side(self.top), support.sides, element, hold
                 )
-            return self._with_sample(layer, window, held, element, bulk, hold)
+            return self._with_sample(layer, window, support, element, bulk, hold)
         except DeckError:
             raise
         except ValueError as cause:
             raise self.layer.body.place.refuse(str(cause)) from None
 
-    def _side(self, end: Surface | Held) -> Side:
+    def _side(self, end: Surface | Constrained) -> Side:
         if isinstance(end, Surface):
             if not self._covers(end):
                 raise end.place.refuse(f"*CONTACT PAIR: {end.body.name} is smaller than the layer; it must cover it.")
@@ -149,23 +149,23 @@ class Problem:
             for theirs, own in ((end.plane.x, self.layer.x), (end.plane.y, self.layer.y))
         )
 
-    def _hold(self, held: Supports, law: AbstractMaterial) -> float | None:
+    def _hold(self, support: Supports, law: AbstractMaterial) -> float | None:
         """Take springs to ground [N/mm] as they are, but none that only help a solver beside pinned nodes."""
         lx, ly = self.extent
         stiffness = float(law.shear) * lx * ly / float(self.heights[-1].mean())
-        is_help = held.pins > 0 and held.hold < _WEAK * stiffness
-        return None if not held.hold or is_help else held.hold
+        is_help = support.pins > 0 and support.hold < _WEAK * stiffness
+        return None if not support.hold or is_help else support.hold
 
     def _with_sample(
-        self, layer: Layer, window: Side, held: Supports, element: str, bulk: float | None, hold: float | None
+        self, layer: Layer, window: Side, support: Supports, element: str, bulk: float | None, hold: float | None
     ) -> Experiment:
         block = self.sample
         assert block is not None
         assert self.interface is not None
         body = block.body
         other = supports(block, self.deck)
-        if other.sides != held.sides:
-            raise body.place.refuse(f"the sides of {body.name} must be held as the layer's are.")
+        if other.sides != support.sides:
+            raise body.place.refuse(f"the sides of {body.name} must be constrained as the layer's are.")
         for own, theirs in ((self.layer.x, block.x), (self.layer.y, block.y)):
             if max(abs(own[0] - theirs[0]), abs(own[-1] - theirs[-1])) > SAME * self.size:
                 raise body.place.refuse(f"{body.name} must lie over the whole layer and no further.")
@@ -181,7 +181,7 @@ class Problem:
             sample = sample.with_inclusion(labels, laws[1:])
         plate = self._side(self.top)
         return Experiment(
-            layer, sample, self.extent, (self.layer.counts, block.counts), window, self.interface, plate, held.sides,
+            layer, sample, self.extent, (self.layer.counts, block.counts), window, self.interface, plate, support.sides,
             cast(Any, (element, form)), hold,
         )  # fmt: skip
 
@@ -297,12 +297,14 @@ class Problem:
                 f"{self.top.body.name}: the surface runs smoothly through its nodes, where the deck has facets "
                 '(interpolation="bilinear")'
             )
-        held = supports(self.layer, self.deck)
-        if held.pins:
-            said.append(f"{self.layer.body.name}: nodes held in the plane stand for opfem's hold of its mean motion")
-        if held.pins and held.hold:
-            said.append(f"{self.layer.body.name}: springs of {held.hold:.3g} N/mm in total beside them are left out")
-        if isinstance(self.top, Held) and self.top.uz is None:
+        support = supports(self.layer, self.deck)
+        if support.pins:
+            said.append(
+                f"{self.layer.body.name}: nodes constrained in the plane stand for opfem's hold of its mean motion"
+            )
+        if support.pins and support.hold:
+            said.append(f"{self.layer.body.name}: springs of {support.hold:.3g} N/mm in total beside them are left out")
+        if isinstance(self.top, Constrained) and self.top.uz is None:
             said.append("forces press the layer; the contact law of the sample has no part in it")
         said += self._said_of_start()
         return tuple(said)

@@ -8,7 +8,7 @@ from .cards import Card, Place, number
 from .deck import Condition, Members, Step
 from .state import Keyword, State
 
-# Names of Abaqus for what is held, as directions 1 to 3.
+# Names of Abaqus for what is constrained, as directions 1 to 3.
 _HELD = {"ENCASTRE": (1, 2, 3), "PINNED": (1, 2, 3), "XSYMM": (1,), "YSYMM": (2,), "ZSYMM": (3,)}
 _LAST = 6  # direction, of rotations
 # Results that only CalculiX calls so.

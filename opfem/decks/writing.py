@@ -1,6 +1,6 @@
 """`write_inp`: a palpation or an experiment with its loads as a deck of Abaqus or CalculiX, exact or refused.
 
-One flat mesh, which both codes read: soft blocks, and rigid bodies whose nodes are all held or moved.
+One flat mesh, which both codes read: soft blocks, and rigid bodies whose nodes are all constrained or moved.
 """
 
 import os
@@ -95,7 +95,7 @@ class _Deck:
     code: Code
     numbers: Bodies = field(default_factory=Bodies)
     mesh: list[str] = field(default_factory=list)
-    held: list[str] = field(default_factory=list)
+    constrained: list[str] = field(default_factory=list)
     interactions: list[str] = field(default_factory=list)
     pairs: list[str] = field(default_factory=list)
     rigid: list[Written] = field(default_factory=list)
@@ -123,7 +123,7 @@ class _Deck:
         if any(isinstance(load, Imprint) for load in self.loads):
             head.append("** The surface PRESS has facets; opfem's runs smoothly through the same nodes.")
         model = [*head, *self.mesh, *rigid_lines(self.rigid, self.density), *self.interactions]
-        boundary = ["*BOUNDARY", *self.held] if self.held else []
+        boundary = ["*BOUNDARY", *self.constrained] if self.constrained else []
         pairs = [] if self.is_explicit else self.pairs
         return "\n".join([*model, *boundary, *pairs, *self._steps(moved), ""])
 
@@ -134,10 +134,10 @@ class _Deck:
         self.mesh += [*lines, *material_lines(body, law, element, self.density, damping)]
         return body
 
-    def _rigid(self, body: Written, lines: list[str], held: str) -> Written:
+    def _rigid(self, body: Written, lines: list[str], constrained: str) -> Written:
         self.mesh += lines
         self.rigid.append(body)
-        self.held.append(f"{body.name}, {held}")
+        self.constrained.append(f"{body.name}, {constrained}")
         return body
 
     @property
@@ -166,7 +166,7 @@ class _Deck:
         elif isinstance(load, Displacement):
             interface = "bonded" if load.lateral == "fixed" else "uz"
             if load.lateral == "fixed":
-                self.held.append("LAYER_HIGH, 1, 2")
+                self.constrained.append("LAYER_HIGH, 1, 2")
         self._sides(layer, palpation.sides)
         share = np.asarray(tributary_area(jnp.asarray(X[:, 0])))
         self._hold(layer, 0, interface, palpation.window, share / share.sum())
@@ -177,7 +177,7 @@ class _Deck:
             self._rigid(*self.numbers.plate("WINDOW", self._rigid_kind, self.extent, z, above=False), "1, 3")
             self._touch("I_WINDOW", window, "LAYER_LOW", "WINDOW_HIGH")
         else:
-            self.held.append("LAYER_LOW, 1, 3" if isinstance(window, Bonded) else "LAYER_LOW, 3, 3")
+            self.constrained.append("LAYER_LOW, 1, 3" if isinstance(window, Bonded) else "LAYER_LOW, 3, 3")
 
     def _press(self, palpation: Palpation, X: np.ndarray) -> Written:
         """Write the rigid surface of an imprint, where its law has no pressure on the unloaded layer."""
@@ -228,7 +228,7 @@ class _Deck:
             moved = self._rigid(*self.numbers.plate("PLATE", self._rigid_kind, self.extent, z, above=True), "1, 2")
             self._touch("I_PLATE", plate, "SAMPLE_HIGH", "PLATE_LOW")
         elif isinstance(plate, Bonded):
-            self.held.append("SAMPLE_HIGH, 1, 2")
+            self.constrained.append("SAMPLE_HIGH, 1, 2")
         for body in (layer, sample):
             self._sides(body, experiment.sides)
         for body, low, top in ((layer, experiment.window, "contact"), (sample, interface, _PLATES[type(plate)])):
@@ -242,7 +242,7 @@ class _Deck:
                 at = 0 if side[1] == "0" else -1
                 nodes = body.numbers[..., at] if side[0] == "x" else body.numbers[:, at]
                 self.mesh += listed("NSET", f"{body.name}_{side.upper()}", nodes.ravel().tolist())
-                self.held.append(f"{body.name}_{side.upper()}, {'xy'.index(side[0]) + 1}")
+                self.constrained.append(f"{body.name}_{side.upper()}, {'xy'.index(side[0]) + 1}")
 
     def _hold(self, body: Written, level: int, interface: str, low: Side, share: np.ndarray) -> None:
         """Write springs for a stated hold; where none is, pin what nothing but friction keeps in place."""
@@ -264,7 +264,9 @@ class _Deck:
         _, my, mx = body.numbers.shape
         middle = body.numbers[level, my // 2]
         first, other = middle[mx // 2], middle[mx // 2 - max(mx // 20, 1)]
-        self.held += [f"{first}, {k + 1}" for k in range(2) if drifts[k]] + ([f"{other}, 2"] if drifts[2] else [])
+        self.constrained += [f"{first}, {k + 1}" for k in range(2) if drifts[k]] + (
+            [f"{other}, 2"] if drifts[2] else []
+        )
         if self.code == "calculix":
             self._springs(body, np.full(share.shape, _HELP))
 

@@ -94,7 +94,7 @@ def _law_lines(name: str, law: AbstractMaterial, density: float | None, damping:
 
 
 def rigid_lines(bodies: list[Written], density: float | None) -> list[str]:
-    """Write the material of rigid bodies, which nothing depends on: all of their nodes are held or moved."""
+    """Write the material of rigid bodies, which nothing depends on: all of their nodes are constrained or moved."""
     if not bodies:
         return []
     lines = ["*MATERIAL, NAME=RIGID", *([] if density is None else ["*DENSITY", f"{show(density)},"])]

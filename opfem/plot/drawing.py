@@ -1,4 +1,4 @@
-"""Each map of a result on axes of its own, without key or title: what single pictures and pages of maps share.
+"""Each map of a result on its own axes, without key or title: what single pictures and pages of maps share.
 
 Edge of the chain: drawn from the dataset of `to_xarray`, and from its maps on the pixels of the measured one.
 """

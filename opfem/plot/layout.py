@@ -77,7 +77,7 @@ def empty_page(count: int, limits: Limits) -> Figure:
 def draw_page(
     panels: Mapping[str, Callable[[Axes], Any]], limits: Limits, figure: Figure | SubFigure | None = None
 ) -> np.ndarray:
-    """Draw maps on a page of their own: all show the same part of the layer, and one key names their hatches.
+    """Draw a page of maps: all show the same part of the layer, and one key names their hatches.
 
     Args:
         panels: What draws each map, by its title.

@@ -29,7 +29,7 @@ def plot_layer(
     """Put the deformed layer into a 3-D scene, coloured on its top by what the sample does to it [kPa].
 
     It lies as on the maps, x to the right and y towards the viewer, its face at the sample up: the mirror image of the
-    layer itself, as a map is that is looked at from the sample. The scene is returned, not shown: call `.show()` on it,
+    layer itself, as a map is seen from the sample. The scene is returned, not shown: call `.show()` on it,
     or `.screenshot(path)` on one that is off screen.
 
     Args:

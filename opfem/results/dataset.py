@@ -282,7 +282,7 @@ def _fit(fit: TractionFit) -> dict[str, Variable]:
         "observed": variable((), fit.observed, "1", "independent numbers of the map on the mesh's splines"),
         "reduced_chi2": variable((), fit.reduced_chi2, "1", "chi2 over the degrees of freedom left"),
         "resolution_points": variable(
-            ("resolution_point", "lateral"), fit.resolution_points, "mm", "where the resolution was looked at"
+            ("resolution_point", "lateral"), fit.resolution_points, "mm", "where the resolution was computed"
         ),
         "resolution_width": variable(
             ("resolution_point",), fit.resolution_width, "mm", "full width at half maximum of the resolution kernel"

@@ -114,12 +114,12 @@ def csv_bytes(data: xr.Dataset) -> bytes:
     Args:
         data: What `sweep` returned.
     """
-    held = columns(data)
-    numbers = {**held.axes, **held.outputs}
-    words = {"status": held.status, "message": held.message, "wall_time [s]": held.wall_time}
+    parts = columns(data)
+    numbers = {**parts.axes, **parts.outputs}
+    words = {"status": parts.status, "message": parts.message, "wall_time [s]": parts.wall_time}
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow([*map(held.title, numbers), *words])
+    table.writerow([*map(parts.title, numbers), *words])
     table.writerows([_written(value) for value in row] for row in zip(*numbers.values(), *words.values(), strict=True))
     return text.getvalue().encode()
 

@@ -246,8 +246,11 @@ def test_sides_pins_and_springs(read):
     assert (rolled.sides, rolled.hold) == (("roller", "free", "free", "free"), None)
     pinned = [*held[:at], "*Boundary", "Layer-1.Pin, 1, 2", *held[at:]]
     assert read(pinned).experiment().hold is None
-    assert any("nodes held in the plane" in said for said in read(pinned).assumed())
-    for held_so, words in (("1, 2", "40 displacements of LAYER-1 are held"), ("3", "are held along z besides")):
+    assert any("nodes constrained in the plane" in said for said in read(pinned).assumed())
+    for held_so, words in (
+        ("1, 2", "40 displacements of LAYER-1 are constrained"),
+        ("3", "are constrained along z besides"),
+    ):
         bottom = ["*Nset, nset=Bottom, generate", "1, 20"]
         at = lines.index("*Solid Section, elset=LayerAll, material=Rubber")
         both = lines[:at] + bottom + lines[at:]
@@ -258,7 +261,7 @@ def test_sides_pins_and_springs(read):
     wrong = [*held[:at], *held[at:]]
     at = wrong.index("*Boundary")
     said = refusal(read([*wrong[:at], "*Boundary", "Layer-1.Left, 2", *wrong[at:]]).experiment)
-    assert "12 displacements of LAYER-1 are held that are no whole face of it, such as y of node 1." in said
+    assert "12 displacements of LAYER-1 are constrained that are no whole face of it, such as y of node 1." in said
 
 
 def test_materials(read):
