@@ -47,7 +47,7 @@ class Newton(eqx.Module):
         max_steps: Newton steps per increment before it is cut.
         min_increment: Smallest load increment [-]; the solve fails below it.
         max_increments: Limit of increments, repeated ones included.
-        krylov_rtol: Relative residual of each linear solve [-]; a third of it in an increment that was cut. The coin
+        krylov_rtol: Relative residual of each linear solve [-]; a tenth of it in an increment that was cut. The coin
             takes a sixth longer with 1e-2, and longer with 1e-1 and 1e-3.
         krylov_steps: Limit of preconditioner applications per linear solve.
         max_backtracks: Halvings of a Newton step that inverts an element, before the increment is cut.
