@@ -155,6 +155,7 @@ def _of_map(
         measured = solution.load.thickness
     maps = on_pixels(dataset, measured)
     compression = 100.0 * maps["compression"].values[maps["contact_status"].values > 0]
+    compression = compression[np.isfinite(compression)]  # unknown beyond the unloaded layer
     return {
         "compression_mean_percent": float(compression.mean()) if compression.size else math.nan,
         "compression_max_percent": float(compression.max()) if compression.size else math.nan,

@@ -105,3 +105,11 @@ def test_failure_is_null(failed_solution):
     assert numbers["residual_rms_um"] is None
     assert numbers["warnings"] == []
     assert numbers["force_sample_N"] == [None, None, None]
+
+
+def test_pixels_beyond_the_unloaded_layer_have_no_compression(solution, numbers):
+    """The layer bulges by 43 to 48 µm; a wider map, in steps of 20 µm, has pixels over the bulge."""
+    wide = op.ThicknessMap(jnp.full((111, 111), 0.45), extent=(2.2, 2.2), origin=(-0.1, -0.1))
+    found = op.summary(solution, wide)
+    assert found["compression_mean_percent"] == pytest.approx(numbers["compression_mean_percent"], rel=0.05)
+    assert found["compression_max_percent"] == pytest.approx(numbers["compression_max_percent"], rel=0.01)
