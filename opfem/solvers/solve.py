@@ -1,5 +1,6 @@
 """`solve`: a palpation under a load, by implicit statics or explicit dynamics."""
 
+import functools
 import warnings
 from typing import Any, cast, overload
 
@@ -138,7 +139,7 @@ def _check_memory(palpation: Palpation | Experiment) -> None:
         )
 
 
-@QuickJit
+@functools.partial(QuickJit, once=True)
 def prepare(palpation, load, load_start, solver, state: State | None, traced: bool) -> tuple[AbstractProblem, Stepping]:
     """Discretise a palpation or an experiment under a load, and initialise the load stepping at a state or at rest."""
     if isinstance(palpation, Experiment):
@@ -217,7 +218,7 @@ def _approach(problem: Any, s: Stepping, load: Load) -> Array:
     return recover(problem, s.before, s.state, load).stats["approach"]
 
 
-@QuickJit
+@functools.partial(QuickJit, once=True)
 def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
     """Build the solution from the final state of the load stepping."""
     ok = s.state.fraction >= 1.0
