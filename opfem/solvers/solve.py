@@ -218,7 +218,7 @@ def _approach(problem: Any, s: Stepping, load: Load) -> Array:
     return recover(problem, s.before, s.state, load).stats["approach"]
 
 
-@functools.partial(QuickJit, once=True)
+@QuickJit
 def finish(problem: Any, s: Stepping, palpation: Any, load: Any) -> Any:
     """Build the solution from the final state of the load stepping."""
     ok = s.state.fraction >= 1.0
