@@ -123,6 +123,7 @@ def unresolved_std(surfaces: MeasuredSurface, std: Float[Array, "maps py px"]) -
     return jnp.sqrt(jnp.maximum(excess, 0.0))
 
 
+@QuickJit
 def interface_heights(mesh: LayerMesh, u: Float[Array, "3 my mx"]) -> Nodes:
     """Compute the height of the deformed interface [mm] at the positions of the mesh's undeformed nodes.
 
