@@ -66,13 +66,14 @@ def checks(dataset: xr.Dataset, pixels: xr.Dataset, inputs: list[Input]) -> list
         inputs: What it rests on.
     """
     attrs = dataset.attrs
+    warnings = json.loads(attrs.get(WARNINGS, "[]"))
     left = imbalance(dataset)
     balance = "Nothing presses." if math.isnan(left) else f"Forces balance: {small_percent(left)} % is left."
     return [
         Check(attrs["status"] == "successful", f"The solve converged. {attrs.get('status_message', '')}"),
         Check(not left > _BALANCED, balance),
-        *(Check(False, warning) for warning in json.loads(attrs.get(WARNINGS, "[]"))),
-        *_fit(dataset),
+        *(Check(False, warning) for warning in warnings),
+        *(() if any("χ²" in warning for warning in warnings) else _fit(dataset)),
         *_missing(pixels),
         *_inputs(inputs, assumptions(dataset), ASSUMED in attrs),
     ]

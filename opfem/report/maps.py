@@ -143,7 +143,7 @@ def _statuses(pixels: xr.Dataset) -> list[ReportMap]:
             f"{prefix}status",
             f"Contact with the {other}",
             "",
-            f"Where the layer touches the {other}: open is clear of it, stick rests by friction, slip slides.",
+            f"Where the layer touches the {other}: open: clear of it, sticks: friction keeps it, slips: it slides.",
             *axes,
             pixels[f"{prefix}contact_status"].values,
             "status",

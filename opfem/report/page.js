@@ -84,8 +84,10 @@
       `A (${said[0]}, ${said[1]}) mm to B (${said[2]}, ${said[3]}) mm, ${length.toFixed(2)} mm long`;
   }
 
-  // A page of paper is narrower than a screen: plots are drawn for it while it is printed; the layer is scaled instead,
-  // as what draws it takes longer than the browser waits.
+  // A page of paper is narrower than a screen: plots are drawn for it while it is printed. An image stands for the
+  // layer, which a browser prints blank: it is made ahead, as that takes longer than printing waits.
+  const image = document.getElementById("layer-on-paper");
+  const copy = async div => { image.src = await Plotly.toImage(div, {format: "png", width: 900, height: 520, scale: 2}); };
   const plotted = Object.keys(plots).filter(id => id !== "layer");
   addEventListener("beforeprint", () => {
     document.body.classList.add("printing");
@@ -109,7 +111,8 @@
     document.querySelectorAll(".plot.more").forEach(div => {
       const {scene} = plots[div.id].layout, narrow = Math.max(1, Math.sqrt(620 / div.clientWidth));
       if (scene) for (const axis of "xyz") scene.camera.eye[axis] *= narrow;  // farther off, so that all of it is seen
-      draw(div.id, plainly);
+      const drawn = draw(div.id, plainly);
+      if (div.id === "layer") drawn.then(copy).then(() => div.on("plotly_relayout", () => copy(div)));
     });
     document.documentElement.dataset.ready = "true";
   });

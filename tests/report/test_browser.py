@@ -135,7 +135,14 @@ return {
   sizes: drawn.map(({width, height}) => [Math.round(width), Math.round(height)]),
   curves: document.getElementById("section").data.map(({y}) => y.filter(value => value !== null).length),
   layer: document.querySelector("#layer canvas").width,
+  paper: await printed(),
 };
+async function printed() {
+  const image = document.getElementById("layer-on-paper");
+  while (!image.naturalWidth) await wait(20);
+  dispatchEvent(new Event("beforeprint"));
+  return [getComputedStyle(image).display, getComputedStyle(document.getElementById("layer")).display];
+}
 """
 IMPRINT = ["thickness", "compression", "pressure", "status", "window_status", "residual"]
 
@@ -148,6 +155,7 @@ def looked_at(page, scratch, expected):
     assert len({tuple(size) for size in found["sizes"]}) == 1
     assert min(found["curves"]) > 200
     assert found["layer"] > 300
+    assert found["paper"] == ["block", "none"]
 
 
 def test_fit_opens(fitted, loaded, tmp_path):
