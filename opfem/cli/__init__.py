@@ -22,9 +22,10 @@ def main(tokens: Sequence[str] | None = None) -> None:
     """
     if tokens is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, leave)
-    from .running import tolerant_output
+    from .running import tolerant_output, without_notes_of_matplotlib
 
     tolerant_output()
+    without_notes_of_matplotlib()
     try:
         from .commands import run
 

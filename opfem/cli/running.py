@@ -3,6 +3,7 @@
 import _thread
 import codecs
 import io
+import logging
 import signal
 import socket
 import sys
@@ -27,6 +28,11 @@ def tolerant_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="opfem")
+
+
+def without_notes_of_matplotlib() -> None:
+    """Leave out two lines on a list of fonts that cannot be kept; opfem says the same of its programs in one."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def _degraded(error: UnicodeError) -> tuple[str, int]:
