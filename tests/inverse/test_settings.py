@@ -8,8 +8,8 @@ import opfem as op
 
 
 def test_settings_are_changed_by_name():
-    settings = op.FitSettings(draws=4).changed(rtol=1e-2)
-    assert (settings.draws, settings.rtol) == (4, 1e-2)
+    settings = op.FitSettings(draws=4).changed(rtol=1e-3)
+    assert (settings.draws, settings.rtol) == (4, 1e-3)
     assert settings.max_steps == op.FitSettings().max_steps
 
 
