@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from ..results import touching_compression
 from .convergence import imbalance, small_percent
 from .inputs import ASSUMED, Input, assumptions
 from .maps import KPA
-from .numbers import compression, mean_pressure, touching_share
+from .numbers import mean_pressure, touching_share
 
 WARNINGS = "warnings"
 """Attribute of a dataset: a JSON list of sentences of what limits the result."""
@@ -53,7 +54,7 @@ def in_short(dataset: xr.Dataset, pixels: xr.Dataset) -> str:
         f"The sample presses on the layer with {-1e3 * float(dataset['force_sample'][2]):.3g} mN and touches "
         f"{100.0 * share:.0f} % of it. Where it touches, the pressure is {mean_pressure(dataset):.2g} kPa in the mean"
         f"{sure} and {KPA * float(dataset['pressure'].max()):.3g} kPa at most; the layer is compressed by up to "
-        f"{compression(pixels)[1]:.0f} %."
+        f"{touching_compression(pixels)[1]:.0f} %."
     )
 
 

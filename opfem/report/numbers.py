@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from ..results import residual_rms
+from ..results import residual_rms, touching_compression
 from .maps import KPA, OPEN, STATUS, UM
 
 _SMALLEST = 1e-3  # mN: smaller lateral forces are round-off
@@ -66,16 +66,6 @@ def mean_pressure(dataset: xr.Dataset) -> float:
     return KPA * float(np.sum(dataset["pressure"].values * area)) / max(float(np.sum(area)), np.finfo(float).tiny)
 
 
-def compression(pixels: xr.Dataset) -> tuple[float, float]:
-    """Compute the mean and the largest compression where the sample touches [%]; NaN where it does not.
-
-    Args:
-        pixels: What `on_pixels` returned.
-    """
-    values = 100.0 * pixels["compression"].values[pixels["contact_status"].values > OPEN]
-    return (float(values.mean()), float(values.max())) if values.size else (math.nan, math.nan)
-
-
 def _touches(dataset: xr.Dataset) -> np.ndarray:
     return dataset["contact_status"].values != OPEN
 
@@ -92,7 +82,7 @@ def _pressures(dataset: xr.Dataset) -> list[Row]:
 
 
 def _compression(pixels: xr.Dataset) -> list[Row]:
-    mean, largest = compression(pixels)
+    mean, largest = touching_compression(pixels)
     return [
         Row("Compression, mean", f"{mean:.3g}", "%", "of the unloaded thickness, where the sample touches"),
         Row("Compression, largest", f"{largest:.3g}", "%", "where the layer is thinnest"),

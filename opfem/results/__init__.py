@@ -9,7 +9,7 @@ from .dataset import to_xarray
 from .interior import LayerFields, layer_fields, sample_fields
 from .measured import measured_thickness
 from .oct_scene import OctScene, oct_scene
-from .pixels import on_pixels
+from .pixels import on_pixels, touching_compression
 from .summary import layer_rows, pressure_rows, summary, summary_rows
 
 __all__ = [
@@ -33,4 +33,5 @@ __all__ = [
     "summary",
     "summary_rows",
     "to_xarray",
+    "touching_compression",
 ]

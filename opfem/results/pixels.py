@@ -3,6 +3,8 @@
 Last stage of the chain; made from the dataset of `to_xarray`, or from one that was read back.
 """
 
+import math
+
 import numpy as np
 import xarray as xr
 
@@ -48,6 +50,19 @@ def on_pixels(dataset: xr.Dataset, measured: ThicknessMap | None = None) -> xr.D
         "y_image": variable(("y_image",), y, "mm", "position of image rows"),
     }
     return xr.Dataset(maps, coords=coordinates, attrs=dataset.attrs)
+
+
+def touching_compression(pixels: xr.Dataset) -> tuple[float, float]:
+    """Compute the mean and the largest compression where the sample touches [%]; NaN where it does not.
+
+    Pixels beyond the unloaded layer, which bulges, are left out.
+
+    Args:
+        pixels: What `on_pixels` returned.
+    """
+    values = 100.0 * pixels["compression"].values[pixels["contact_status"].values > OPEN]
+    values = values[np.isfinite(values)]
+    return (float(values.mean()), float(values.max())) if values.size else (math.nan, math.nan)
 
 
 def _maps(dataset: xr.Dataset, x: np.ndarray, y: np.ndarray) -> dict[str, Variable]:

@@ -15,7 +15,7 @@ from ..model import Imprint
 from ..solvers import ExperimentSolution, Solution
 from .cautions import cautions, residual_rms, volume_ratio
 from .dataset import status_message, status_name, to_xarray
-from .pixels import on_pixels
+from .pixels import on_pixels, touching_compression
 
 _KPA = 1e3
 _UM = 1e3
@@ -154,11 +154,10 @@ def _of_map(
     if measured is None and isinstance(solution.load, Imprint):
         measured = solution.load.thickness
     maps = on_pixels(dataset, measured)
-    compression = 100.0 * maps["compression"].values[maps["contact_status"].values > 0]
-    compression = compression[np.isfinite(compression)]  # unknown beyond the unloaded layer
+    mean, largest = touching_compression(maps)
     return {
-        "compression_mean_percent": float(compression.mean()) if compression.size else math.nan,
-        "compression_max_percent": float(compression.max()) if compression.size else math.nan,
+        "compression_mean_percent": mean,
+        "compression_max_percent": largest,
         "residual_rms_um": _UM * residual_rms(maps),
         "warnings": cautions(solution, dataset, maps, measured),
     }

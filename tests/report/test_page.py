@@ -224,3 +224,10 @@ def test_failed_solve_is_refused(failed_solution, tmp_path):
         op.write_report(failed_solution, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
     assert isinstance(op.to_xarray(failed_solution), xr.Dataset)
+
+
+def test_pixels_beyond_the_unloaded_layer_have_no_compression(solution, tmp_path):
+    """As in the decks, whose surfaces are wider than the layer."""
+    wide = op.ThicknessMap(np.full((111, 111), 0.45), extent=(2.2, 2.2), origin=(-0.1, -0.1))
+    numbers, text = op.summary(solution, wide), written(op.to_xarray(solution), tmp_path / "report.html", wide)
+    assert f"compressed by up to {numbers['compression_max_percent']:.0f} %" in text
