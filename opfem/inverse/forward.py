@@ -102,8 +102,8 @@ class Linearised(eqx.Module):
 
         On the coin this leaves 9 of 13 solves, and products change by 5e-4.
         """
-        pairs = itertools.pairwise([*path.solves, None])
-        solves = [solve for solve, after in pairs if after is None or not _settle(solve, after)]
+        pairs = itertools.pairwise(path.solves)
+        solves = [solve for solve, after in pairs if not _settle(solve, after)] + path.solves[-1:]
         return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in solves], solver)
 
     def push(self, moved: Problem, first: Handed) -> Field:
