@@ -49,8 +49,8 @@ def run_calibration(
                 f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
             )
         columns = tuple(int(name) if name.lstrip("-").isdigit() else name for name in reading.columns)
-        columns_of: dict[str, Any] = {**vars(reading), "columns": columns}
-        data = [read_stress_strain(path, **columns_of) for path in curves]
+        arguments: dict[str, Any] = {**vars(reading), "columns": columns}
+        data = [read_stress_strain(path, **arguments) for path in curves]
         prepare(out)
         progress.stage("fit")
         found = calibrate(

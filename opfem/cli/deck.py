@@ -49,10 +49,8 @@ def state_deck(file: Path, out: Path | None, options: DeckOptions, run: RunOptio
     refused: DeckError | None = None
     loads: tuple[Any, ...] = ()
     try:
-        experiment, loads = (
-            deck.experiment(options.bulk, options.layer),
-            deck.loads(options.interpolation, options.layer),
-        )
+        experiment = deck.experiment(options.bulk, options.layer)
+        loads = deck.loads(options.interpolation, options.layer)
         console.print(f"opfem takes it as {_words(experiment, loads, deck)}", markup=False, soft_wrap=True)
         for said in deck.assumed(options.bulk, options.layer):
             console.print(f"  {said}", markup=False, soft_wrap=True)
@@ -150,10 +148,8 @@ def solve_deck(
         configure_jax(run.no_cache)
         settle(out, run.force)
         deck = read_inp(file, code=options.code)
-        experiment, loads = (
-            deck.experiment(options.bulk, options.layer),
-            deck.loads(options.interpolation, options.layer),
-        )
+        experiment = deck.experiment(options.bulk, options.layer)
+        loads = deck.loads(options.interpolation, options.layer)
         solver = _solver(deck, options)
         prepare(out)
     assumed = deck.assumed(options.bulk, options.layer)

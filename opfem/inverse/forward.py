@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..model import Palpation, Traction
 from ..solvers import Solution
-from ..solvers.derivative import Handed, Slot, Solve, follow_path, linearise, pull, push
+from ..solvers.derivative import Handed, Slot, Solve, follow_path, linearised, pull, push
 from ..solvers.discretise import discretise
 from ..solvers.equilibrium import Problem
 from ..solvers.newton import Newton
@@ -84,7 +84,7 @@ def resume(problem: Problem, s: Stepping, solver: Newton) -> Stepping:
 
 
 class Linearised(eqx.Module):
-    """First-order derivative of the displacement by the problem, to 1e-4.
+    """First-order derivative of the displacement by the problem, to 3e-4.
 
     Attributes:
         problem: The problem.
@@ -104,7 +104,7 @@ class Linearised(eqx.Module):
         """
         pairs = itertools.pairwise(path.solves)
         solves = [solve for solve, after in pairs if not _settle(solve, after)] + path.solves[-1:]
-        return cls(path.problem, [Slot(solve, linearise(path.problem, solve)) for solve in solves], solver)
+        return cls(path.problem, linearised(path.problem, solves), solver)
 
     def push(self, moved: Problem, first: Handed) -> Field:
         """Compute the change of the displacement with changes of the problem and of the initial state."""

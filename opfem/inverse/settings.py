@@ -51,7 +51,8 @@ class FitSettings(eqx.Module):
         foundation_stiffness: Stiffness of the elastic foundation over shear modulus per thickness [-]; 0: a dead load.
             The published coin snaps through at 2.5 and less, not at 8 and more. A fit on 40×40×4 elements of 5 × 5 mm
             takes 45 CG iterations in 5 solves at 7.5, 52 in 5 at 19, 68 in 6 at 75, and 92 in 13 without foundation.
-            The coin takes 13 solves at 20 and at 60, with 191 and 206 CG iterations; more at 7.5.
+            The coin, under the sample's friction and fitted to `rtol` 1e-2, takes 13 solves at 20 and at 60, with 191
+            and 206 CG iterations; more at 7.5.
         contact_pressure: Mean pressure over the shear modulus above which the layer counts as in contact with its
             window [-]; the foundation alone would balance a layer that has lifted off.
         softness: Pressure over the shear modulus below which a non-negative pressure approaches zero smoothly [-]: 0.3

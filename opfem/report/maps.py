@@ -143,7 +143,7 @@ def _statuses(pixels: xr.Dataset) -> list[ReportMap]:
             f"{prefix}status",
             f"Contact with the {other}",
             "",
-            f"Where the layer touches the {other}: open: clear of it, sticks: friction keeps it, slips: it slides.",
+            f"Open: the layer is clear of the {other}. Sticks: friction keeps it in place. Slips: it slides.",
             *axes,
             pixels[f"{prefix}contact_status"].values,
             "status",
