@@ -8,13 +8,17 @@ Run `python -m benchmarks.traction_fit CASE`, CASE one of
   without preconditioner, and the whole fit in forward solves; 0 leaves a mask out; each fit twice, the second time
   nothing is compiled, or once;
 - `coin MAP [--elements 40] [--model-std 4] [--out FILE.png]`: the published coin beside its imprint, also with a
-  traction along z; and a map simulated from a draw of its posterior, beside that;
+  traction along z; and a map simulated from a draw of its posterior, beside that; or `--measured-only`;
 - `coverage [--fits 400] [--first 0] [--believed 1]`: truths drawn from the prior on 12 × 12 × 2, one functional each;
   `--believed 2.5` takes a wrong bulk modulus, so that it must fail;
 - `edge [--out FILE.png]`: a step of pressure, its edge-spread width against mesh, noise and prior;
 - `parameters [--fits 100]`: window friction and C10 from three maps and readings of the force.
 
-Each prints JSON lines.
+Each prints JSON lines. `--without RESCUE` switches one part of the algorithm off, for any case:
+
+- `foundation`: a dead load instead of the elastic foundation;
+- `jumps`: no step may increase the misfit;
+- `secants`: no quasi-Newton pairs, neither of steps nor of CG iterations.
 """
 
 import argparse
@@ -33,7 +37,8 @@ from scipy.interpolate import RectBivariateSpline
 
 import opfem as op
 from opfem.inverse.measured_surface import interface_heights
-from opfem.optimise.conjugate_gradients import least_squares, plus
+from opfem.optimise.conjugate_gradients import Secants, least_squares, plus
+from opfem.optimise.line_search import ParabolicBacktracking
 
 C10, C01, BULK = 2.23e-3, 7.03e-4, 0.11732  # MPa
 NOISE = 2e-3  # mm
@@ -41,6 +46,19 @@ THICKNESS = 0.5  # mm
 ELEMENT = 0.125  # mm
 # Events of jax.monitoring: lowering and compiling.
 COMPILING = ("/jax/core/compile/jaxpr_to_mlir", "/jax/core/compile/backend_compile")
+# Settings of a fit without one of its rescues; secants have none, see `main`.
+RESCUES = {
+    "foundation": {"foundation_stiffness": 0.0},
+    "jumps": {"line_search": ParabolicBacktracking(short=0.0)},
+    "secants": {},
+}
+# Those of this run, `--without`.
+changed: dict = {}
+
+
+def fit_map(*arguments, **options) -> op.TractionFit:
+    """Fit, without the rescue that `--without` names."""
+    return op.fit_traction(*arguments, **options, **changed)
 
 
 def experiment(
@@ -105,9 +123,9 @@ def truth_case() -> None:
     prior = op.Matern(length=0.5, std=1.5e-3, mean=3e-3)
     begin = time.perf_counter()
     # This truth pushes along z.
-    first = op.fit_traction(coarse, measured, prior, lateral="friction", model_std=0.0, draws=2)
+    first = fit_map(coarse, measured, prior, lateral="friction", model_std=0.0, draws=2)
     seconds = time.perf_counter() - begin
-    fit = op.fit_traction(coarse, measured, prior, lateral="friction", draws=32)
+    fit = fit_map(coarse, measured, prior, lateral="friction", draws=32)
     imprint = op.solve(coarse, op.Imprint(measured.smoothed(fwhm=ELEMENT)))
     linear, uniaxial = op.linear_estimate(coarse, measured, prior), op.uniaxial_estimate(coarse, measured)
     off = jnp.abs(fit.normal - truth)
@@ -177,7 +195,7 @@ def cost_case(elements: list[int], missing: float, block: float, times: int, inc
             for _ in range(times):
                 compiling.clear()
                 begin = time.perf_counter()
-                fit = op.fit_traction(palpation, measured, prior, lateral="friction", solver=settings, draws=2)
+                fit = fit_map(palpation, measured, prior, lateral="friction", solver=settings, draws=2)
                 seconds.append(round(time.perf_counter() - begin, 1))
                 compile_seconds.append(round(sum(compiling), 1))
             begin = time.perf_counter()
@@ -220,7 +238,7 @@ def unpreconditioned(fit: op.TractionFit) -> int:
     return int(solve(posterior, jax.tree.map(lambda s: jax.random.normal(key, s.shape, s.dtype), structure)))
 
 
-def coin_case(path: Path, n: int, model_std: float | None, out: Path | None) -> None:
+def coin_case(path: Path, n: int, model_std: float | None, out: Path | None, measured_only: bool) -> None:
     """The published coin as measured, and a map of a draw from its posterior, with errors as large as the fit expects.
 
     The optimum itself would not do as a truth: it is smoother than what its prior expects, so that χ² comes out low.
@@ -231,6 +249,8 @@ def coin_case(path: Path, n: int, model_std: float | None, out: Path | None) -> 
     prior = op.Matern(length=0.5, std=4e-3, mean=op.uniaxial_estimate(palpation, loaded).mean(), smoothness=0.5)
     imprint = op.solve(palpation, op.Imprint(loaded.smoothed(fwhm=0.06)))
     fit = coin_fit("measured", palpation, loaded, prior, model_std, imprint)
+    if measured_only:
+        return
     # The imprint's slopes push sideways, which the sample's friction alone does not.
     along_z = coin_fit("along z", palpation, loaded, prior, model_std, imprint, lateral="friction")
     if out is not None:
@@ -257,7 +277,7 @@ def coin_fit(
 ) -> op.TractionFit:
     """Fit one map of the coin, and compare it with a solution beside it: the imprint or the truth."""
     begin = time.perf_counter()
-    fit = op.fit_traction(palpation, measured, prior, lateral=lateral, model_std=model_std, draws=8, throw=False)
+    fit = fit_map(palpation, measured, prior, lateral=lateral, model_std=model_std, draws=8, throw=False)
     off = fit.pressure - beside.pressure
     row = {
         "map": name,
@@ -321,14 +341,14 @@ def coverage_case(fits: int, first: int, believed: float) -> None:
         solution = op.solve(palpation, op.Traction(truth), settings, throw=False, progress=False)
         measured = as_map(surface(palpation, solution, 49), side, seed=index)
         options = {"solver": settings, "draws": 1, "throw": False, "progress": False}
-        fit = op.fit_traction(assumed, measured, prior, lateral="friction", model_std=0.0, **options)
+        fit = fit_map(assumed, measured, prior, lateral="friction", model_std=0.0, **options)
         row = {"index": index, "message": op.FitStatus[fit.result]}
         if bool(fit.result == op.FitStatus.successful):
             # As smooth as the traction, so that it is neither all noise nor all prior.
             weights = prior.expand(jax.random.normal(jax.random.key(5000 + index), shape), palpation.mesh().spacing)
             std = float(jnp.sqrt(jnp.sum(weights * fit.covariance(weights))))
             row["z"] = float(jnp.sum(weights * (truth - fit.normal))) / std
-            row["chi2"] = round(float(fit.reduced_chi2), 3)
+            row |= {"chi2": round(float(fit.reduced_chi2), 3), **counts(fit)}
         rows.append(row)
         print(json.dumps(row), flush=True)
     z = np.array([row["z"] for row in rows if "z" in row])
@@ -342,6 +362,8 @@ def coverage_case(fits: int, first: int, believed: float) -> None:
                 "inside_90": float(np.mean(np.abs(z) < 1.645)),
                 "reduced_chi2": float(np.median([row["chi2"] for row in rows if "z" in row])),
                 "rank_chi2": float(np.sum((ranks - len(z) / 20) ** 2 / (len(z) / 20))),
+                "forward_solves": float(np.median([row["forward_solves"] for row in rows if "z" in row])),
+                "inner_iterations": float(np.median([row["inner_iterations"] for row in rows if "z" in row])),
             }
         ),
         flush=True,
@@ -378,7 +400,7 @@ def edge_width(elements: tuple[int, int, int], side: float, noise: float, length
     values = heights + noise * np.random.default_rng(0).standard_normal(heights.shape)
     measured = op.ThicknessMap(values, extent=(side, strip), std=noise)
     prior = op.Matern(length=length, std=2e-3, mean=3e-3)
-    fit = op.fit_traction(palpation, measured, prior, lateral="friction", draws=4, throw=False, progress=False)
+    fit = fit_map(palpation, measured, prior, lateral="friction", draws=4, throw=False, progress=False)
     line = 1e3 * np.asarray(jnp.mean(fit.normal, axis=0))
     place = np.linspace(0.0, side, nx + 1)
     low, high = np.mean(line[place < 0.3 * side]), np.mean(line[place > 0.7 * side])
@@ -440,7 +462,7 @@ def parameters_case(fits: int) -> None:
         rng = np.random.default_rng(index)
         maps = [as_map(heights, side, seed=100 * index + i) for i, heights in enumerate(surfaces)]
         readings = [op.ForceReading(f * (1.0 + 0.01 * rng.standard_normal()), 0.01 * f) for f in forces]
-        fit = op.fit_traction(
+        fit = fit_map(
             palpation, maps, wide, parameters=parameters, forces=readings, lateral="friction", model_std=0.0,
             solver=settings, draws=1, progress=False,
         )  # fmt: skip
@@ -472,15 +494,22 @@ def main() -> None:
         help="error of the coin's computed height [µm]; default: by op.mesh_error",
     )
     parser.add_argument("--out", type=Path, help="picture of `edge` or `coin` (.png)")
+    parser.add_argument("--measured-only", action="store_true", help="of `coin`: neither along z nor simulated")
+    parser.add_argument("--without", choices=RESCUES, help="part of the algorithm to switch off")
     chosen = parser.parse_args(sys.argv[1:])
     jax.config.update("jax_enable_x64", True)
+    if chosen.without is not None:
+        changed.update(RESCUES[chosen.without])
+    if chosen.without == "secants":
+        Secants.appended = lambda self, step, change: self  # records nothing
     if chosen.case == "truth":
         truth_case()
     elif chosen.case == "cost":
         cost_case(chosen.elements, chosen.missing, chosen.block, 1 if chosen.once else 2, chosen.increments)
     elif chosen.case == "coin":
         for n in chosen.elements:
-            coin_case(chosen.map, n, None if chosen.model_std is None else 1e-3 * chosen.model_std, chosen.out)
+            model_std = None if chosen.model_std is None else 1e-3 * chosen.model_std
+            coin_case(chosen.map, n, model_std, chosen.out, chosen.measured_only)
     elif chosen.case == "coverage":
         coverage_case(chosen.fits, chosen.first, chosen.believed)
     elif chosen.case == "edge":
