@@ -34,12 +34,14 @@ from .inverse import (
 )
 from .io import (
     Checkpoint as Checkpoint,
+    read_displacement as read_displacement,
     read_netcdf as read_netcdf,
     read_oct as read_oct,
     read_spectra as read_spectra,
     read_stress_strain as read_stress_strain,
     read_thickness as read_thickness,
     write_csv as write_csv,
+    write_displacement as write_displacement,
     write_mat as write_mat,
     write_netcdf as write_netcdf,
     write_oct as write_oct,
@@ -107,6 +109,7 @@ from .plot import (
     plot_fit as plot_fit,
     plot_interface as plot_interface,
     plot_layer as plot_layer,
+    plot_parameters as plot_parameters,
     plot_pressure as plot_pressure,
     plot_report as plot_report,
     plot_residual as plot_residual,

@@ -126,6 +126,32 @@ def fit(
 
 
 @app.command
+def fit_parameters(
+    config: Annotated[
+        Path,
+        Parameter(
+            name="CONFIG",
+            help="A .toml file with [layer], [experiment], [window], [sample], [[state]], [[increment]], [[bulge]], "
+            "[parameters] and [fit]; see the documentation.",
+        ),
+    ],
+    /,
+    *,
+    out: _Out,
+    files: PictureOptions = PictureOptions(),
+    run: RunOptions = RunOptions(),
+) -> None:
+    """Fit frictions, moduli and offsets to forces, maps and displacements of loaded states, as CONFIG says.
+
+    Writes summary.json, parameters.png, the first thing to look at, and result.nc.
+    """
+    from .fit_parameters import run_fit
+
+    with reporting(run.debug):
+        run_fit(config, out, run, files)
+
+
+@app.command
 def sweep(
     config: Annotated[
         Path, Parameter(name="CONFIG", help="A .toml file with [inputs], [axes] and [outputs]; see the documentation.")

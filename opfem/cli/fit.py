@@ -53,7 +53,10 @@ def fit(
         settle(out, run.force)
         measured, unloaded = read_maps(map, reading)
         if measured.std is None:
-            raise ValueError("--std [mm] is needed: the standard deviation of the thickness noise, a positive number.")
+            raise ValueError(
+                "--std [mm] is needed: the standard deviation of the thickness noise, a positive number. Estimate it "
+                "from two maps of one load, as the standard deviation of their difference over √2, or on a flat target."
+            )
         palpation, filled = state_experiment(measured, unloaded, reading, layer, contact)
         prior = state_prior(palpation, filled, options)
         settings = {**settings_of(map, reading, layer, contact, filled), **_options_used(options, prior)}

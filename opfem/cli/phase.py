@@ -1,7 +1,6 @@
 """`opfem oct --phase BEFORE AFTER --out DIR`: the axial displacement between two complex volumes."""
 
 import dataclasses
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ..io import write_together
+from ..io import displacement_bytes, write_together
 from ..measurement.oct import DisplacementVolume, OctSystem, axial_displacement
 from ..solvers.progress import Progress
 from .folder import prepare, refuse_links
@@ -59,7 +58,7 @@ def measure_phase(
         contents = {
             **pictures({FILES[0]: draw_displacement(found)}, files),
             "summary.json": (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode(),
-            "displacement.npz": _bytes(found),
+            "displacement.npz": displacement_bytes(found),
         }
         write_together(out, contents, with_drawings(FILES))
     console = Console(highlight=False)
@@ -86,23 +85,3 @@ def _numbers(found: DisplacementVolume) -> dict[str, Any]:
         "coherence_median": float(np.median(found.coherence)),
         "strain_median": float(np.median(strain.values[known])) if known.any() else None,
     }
-
-
-def _bytes(found: DisplacementVolume) -> bytes:
-    buffer = io.BytesIO()
-    fields = {
-        name: np.asarray(getattr(found, name))
-        for name in (
-            "values",
-            "std",
-            "coherence",
-            "depth",
-            "spacing",
-            "origin",
-            "scale_std",
-            "noise_length",
-            "axial_noise",
-        )
-    }
-    np.savez_compressed(buffer, mask=found.mask, **fields)  # pyright: ignore[reportArgumentType]
-    return buffer.getvalue()

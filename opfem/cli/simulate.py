@@ -20,8 +20,9 @@ from .folder import FINISHED, SIMULATED, UNLOADED, prepare, record_failure, sett
 from .options import ResultOptions, RunOptions
 from .output import show_warnings
 from .record import assumed_keys, with_record
-from .scene import Scene, in_keys, read_scene
+from .scene import Scene, read_scene
 from .statement import configure_jax
+from .toml_parts import in_keys
 
 
 def simulate(

@@ -22,6 +22,7 @@ from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
 from ..model import Load, Palpation
 from ..solvers import Newton, Solution, solve
+from ..solvers.progress import Progress
 from ..solvers.solution import is_failure
 from ..solvers.solve import require_float64
 from .state_residuals import residual, source_of
@@ -29,6 +30,9 @@ from .state_residuals import residual, source_of
 SCALE = "scale"
 """Name of the common factor of all increments: wavelength over refractive index, relative to the assumed ratio."""
 
+# Shown on the progress line during compilation.
+_COMPILES = "the solver, about 10 s the first time"
+_COMPILES_DERIVATIVE = "the solver's derivative, about a minute the first time"
 _STICK = 1  # status of a contact point
 _INSENSITIVE = 1e-3  # norm of a Jacobian column over the largest one, below which the data do not depend on a number
 _PRIOR_DOMINATED = 0.7  # posterior over prior standard deviation: the data halve the variance below it
@@ -44,6 +48,8 @@ class ParameterFit(eqx.Module):
 
     Attributes:
         names: Names of the fitted numbers; static.
+        priors: Their priors, by name.
+        white: Their values as standard normal numbers of their priors, in the order of `names` [-].
         numbers: Their values, by name.
         covariance: Posterior covariance of the numbers, in the order of `names`.
         prior_share: Posterior over prior standard deviation of the white number, by name [-].
@@ -55,6 +61,8 @@ class ParameterFit(eqx.Module):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
+    priors: dict[str, AbstractNumberPrior]
+    white: Float[Array, " k"]
     numbers: dict[str, Array]
     covariance: Float[Array, "k k"]
     prior_share: dict[str, Array]
@@ -74,6 +82,20 @@ class ParameterFit(eqx.Module):
         """Correlation of the numbers [-]."""
         std = jnp.sqrt(jnp.diag(self.covariance))
         return self.covariance / std / std[:, None]
+
+    def intervals(self, coverage: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Compute credible intervals of the numbers, by name.
+
+        Args:
+            coverage: Probability of an interval [-].
+        """
+        half = float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * coverage))
+        found = {}
+        for name, white in zip(self.names, self.white, strict=True):
+            ends = (self.priors[name].number(white + sign * half * self.prior_share[name]) for sign in (-1.0, 1.0))
+            low, high = map(float, ends)
+            found[name] = low, high
+        return found
 
     @property
     def chi2(self) -> dict[str, Array]:
@@ -121,6 +143,7 @@ def fit_parameters(
     rtol: float = 1e-3,
     max_steps: int = 30,
     throw: bool = True,
+    progress: bool = True,
 ) -> ParameterFit:
     """Fit numbers of an experiment to observations of its loaded states.
 
@@ -137,6 +160,7 @@ def fit_parameters(
         rtol: Change of the white numbers, and relative change of χ², at which the fit has converged.
         max_steps: Limit of steps.
         throw: Whether to raise where the fit does not converge.
+        progress: Whether to show progress on a terminal, in a notebook or in a log.
 
     Raises:
         ValueError: For invalid observations or parameters.
@@ -165,19 +189,23 @@ def fit_parameters(
         return jnp.concatenate([*parts(white, states_of(white)), white]), None
 
     white = jnp.zeros(len(names))
-    states = states_of(white)
-    _check_first(pairs, states)
-    data = sum(one.size for one in parts(white, states))
-    white, steps, converged = _least_squares(residuals, white, data, rtol, max_steps)
-    if throw and not converged:
-        raise FitError(
-            f"fit_parameters did not converge within max_steps={max_steps} steps. Raise the limit, or centre the "
-            "priors closer to the true values."
-        )
-    _, along = jax.linearize(lambda w: residuals(w)[0], white)
-    J = jax.vmap(along)(jnp.eye(len(names))).T
-    states = states_of(white)
-    return _fitted(names, numbers_of, white, J, pairs, parts(white, states), states, converged, steps)
+    with Progress(progress) as bar:
+        bar.stage("states at the priors' medians", compiles=_COMPILES)
+        states = states_of(white)
+        _check_first(pairs, states)
+        data = sum(one.size for one in parts(white, states))
+        bar.stage("fit of numbers", compiles=_COMPILES_DERIVATIVE)
+        white, steps, converged = _least_squares(residuals, white, data, rtol, max_steps, bar)
+        if throw and not converged:
+            raise FitError(
+                f"fit_parameters did not converge within max_steps={max_steps} steps. Raise the limit, or centre the "
+                "priors closer to the true values."
+            )
+        bar.stage("posterior")
+        _, along = jax.linearize(lambda w: residuals(w)[0], white)
+        J = jax.vmap(along)(jnp.eye(len(names))).T
+        states = states_of(white)
+    return _fitted(priors, numbers_of, white, J, pairs, parts(white, states), states, converged, steps)
 
 
 def _pairs(observations: Sequence[Any]) -> list[tuple[int, Any]]:
@@ -234,13 +262,16 @@ def _check_first(pairs: list[tuple[int, Any]], states: tuple[Solution, ...]) -> 
                 )
 
 
-def _least_squares(residuals: Any, white: Array, data: int, rtol: float, max_steps: int) -> tuple[Array, int, bool]:
+def _least_squares(
+    residuals: Any, white: Array, data: int, rtol: float, max_steps: int, bar: Progress
+) -> tuple[Array, int, bool]:
     """Run Levenberg–Marquardt on the host: a traced loop would compile the solves of all states as one program."""
     method = optx.LevenbergMarquardt(rtol=rtol, atol=rtol)
     shape = jax.ShapeDtypeStruct((data + white.size,), white.dtype)
     state = method.init(residuals, white, None, {}, shape, None, frozenset())
     for step in range(max_steps):
         white, state, _ = method.step(residuals, white, None, {}, state, frozenset())
+        bar.show(f"step {step + 1}, misfit {float(state.f_info.as_min()):.5g}")
         done, _ = method.terminate(residuals, white, None, {}, state, frozenset())
         if bool(done):
             return white, step + 1, True
@@ -248,7 +279,8 @@ def _least_squares(residuals: Any, white: Array, data: int, rtol: float, max_ste
     return white, max_steps, False
 
 
-def _fitted(names, numbers_of, white, J, pairs, end, states, converged, steps) -> ParameterFit:
+def _fitted(priors, numbers_of, white, J, pairs, end, states, converged, steps) -> ParameterFit:
+    names = tuple(priors)
     data = J[: J.shape[0] - len(names)]
     columns = np.asarray(jnp.sqrt(jnp.sum(data**2, axis=0)))
     inverse = jnp.linalg.inv(J.T @ J)
@@ -258,6 +290,8 @@ def _fitted(names, numbers_of, white, J, pairs, end, states, converged, steps) -
         by_source.setdefault(source_of(observed), []).append(values)
     return ParameterFit(
         names=names,
+        priors=priors,
+        white=white,
         numbers=numbers_of(white),
         covariance=slope * inverse * slope[:, None],
         prior_share=dict(zip(names, jnp.sqrt(jnp.diag(inverse)), strict=True)),

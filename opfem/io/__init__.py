@@ -3,6 +3,7 @@
 from ..measurement import MeasurementError
 from .atomic import finish, take_place, whole_file, write_together, write_whole
 from .checkpoint import Checkpoint as Checkpoint
+from .displacement import displacement_bytes, read_displacement, write_displacement
 from .map_files import MAP_FILES, encoded, write_csv, write_mat, write_tiff
 from .netcdf import netcdf_bytes, read_netcdf, write_netcdf
 from .oct import read_oct, read_spectra, write_oct
@@ -14,10 +15,12 @@ __all__ = [
     "MAP_FILES",
     "MeasurementError",
     "bodies_grid",
+    "displacement_bytes",
     "encoded",
     "finish",
     "layer_grid",
     "netcdf_bytes",
+    "read_displacement",
     "read_netcdf",
     "read_oct",
     "read_spectra",
@@ -27,6 +30,7 @@ __all__ = [
     "vtu_bytes",
     "whole_file",
     "write_csv",
+    "write_displacement",
     "write_mat",
     "write_netcdf",
     "write_oct",

@@ -12,6 +12,7 @@ from .maps import (
     plot_uncertainty,
 )
 from .oct import draw_interface, plot_interface
+from .parameters import draw_parameters, plot_parameters
 from .phase import draw_displacement, plot_displacement
 from .reports import draw_fit, draw_pictures, plot_fit, plot_report
 from .scene import plot_layer
@@ -23,6 +24,7 @@ __all__ = [
     "draw_displacement",
     "draw_fit",
     "draw_interface",
+    "draw_parameters",
     "draw_pictures",
     "draw_simulation",
     "draw_sweep",
@@ -33,6 +35,7 @@ __all__ = [
     "plot_fit",
     "plot_interface",
     "plot_layer",
+    "plot_parameters",
     "plot_pressure",
     "plot_report",
     "plot_residual",

@@ -1,6 +1,7 @@
 """What a solution says: labelled data with units, and a short summary for people."""
 
 from ..calibration import Calibration
+from ..identification import ParameterFit
 from ..inverse import TractionFit
 from ..solvers import ExperimentSolution, Solution
 from .cautions import residual_rms
@@ -19,6 +20,7 @@ __all__ = [
     "FieldMetrics",
     "LayerFields",
     "OctScene",
+    "ParameterFit",
     "Solution",
     "TractionFit",
     "compare",

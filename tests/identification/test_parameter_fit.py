@@ -225,3 +225,22 @@ def test_derivatives_of_increments_against_differences():
     h = 1e-4
     difference = (increments(x + h * direction) - increments(x - h * direction)) / (2 * h)
     np.testing.assert_allclose(derivative, difference, atol=1e-4 * float(jnp.abs(difference).max()))
+
+
+def test_intervals_are_those_of_the_posterior(linear):
+    experiment, observed, _ = linear
+    priors = {"thinning": op.Normal(1.0, 1.0), "wave": op.LogNormal(0.2, 0.5)}
+    found = op.fit_parameters(experiment, [observed], priors, scale=op.Normal(1.0, 1e-7))
+    low, high = found.intervals()["thinning"]
+    assert high - low == pytest.approx(2 * 1.959964 * float(found.std["thinning"]), rel=1e-5)
+    low, high = found.intervals(0.9)["wave"]
+    assert low * high == pytest.approx(float(found.numbers["wave"]) ** 2, rel=1e-9)  # symmetric in the logarithm
+    assert np.log(high / low) == pytest.approx(2 * 1.644854 * 0.5 * float(found.prior_share["wave"]), rel=1e-5)
+
+
+def test_picture_shows_every_number_and_pair(linear):
+    experiment, observed, _ = linear
+    axes = op.plot_parameters(op.fit_parameters(experiment, [observed], PRIORS))
+    assert axes.shape == (3, 3)
+    assert [ax.get_xlabel() for ax in axes[-1]] == ["thinning [-]", "wave [-]", "scale [-]"]
+    assert [[ax.get_visible() for ax in row] for row in axes.tolist()] == np.tri(3, dtype=bool).tolist()

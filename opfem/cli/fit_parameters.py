@@ -1,0 +1,105 @@
+"""`opfem fit-parameters CONFIG --out DIR`: friction, moduli and offsets from what was observed of loaded states."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from rich.console import Console
+from rich.table import Table
+
+from ..identification import ParameterFit, fit_parameters
+from ..io import netcdf_bytes, write_together
+from ..solvers.progress import Progress
+from .folder import prepare, refuse_links
+from .observed_states import read_observed_states
+from .options import PictureOptions, RunOptions
+from .output import pictures, with_drawings
+from .statement import configure_jax
+
+FILES = ("parameters.png", "summary.json", "result.nc")
+"""What the command writes; the last marks a finished result."""
+
+
+def run_fit(config: Path, out: Path, run: RunOptions, files: PictureOptions = PictureOptions()) -> None:
+    """Fit the numbers that a file names, and write them.
+
+    Args:
+        config: The file.
+        out: Folder of the results.
+        run: The run itself.
+        files: Drawings to write, too.
+    """
+    with Progress(True, at_once=True) as progress:
+        progress.stage("reading")
+        configure_jax(run.no_cache)
+        refuse_links(out, with_drawings(FILES))
+        if (out / FILES[-1]).exists() and not run.force:
+            raise FileExistsError(
+                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
+            )
+        states = read_observed_states(config)
+        prepare(out)
+        problem = (states.palpation, states.loads)
+        found = fit_parameters(problem, states.observations, states.parameters, **states.options)
+        progress.stage("pictures")
+        # Loaded here, so that a refused run does not wait for matplotlib.
+        from ..plot import draw_parameters
+
+        numbers = {"config": str(config), **summary_of(found), "stated": states.stated}
+        contents = {
+            **pictures({FILES[0]: draw_parameters(found)}, files),
+            "summary.json": (json.dumps(numbers, indent=2, ensure_ascii=False) + "\n").encode(),
+            "result.nc": bytes(netcdf_bytes(_dataset(found))),
+        }
+        write_together(out, contents, with_drawings(FILES))
+    _show(found, numbers, list(contents), out)
+
+
+def summary_of(found: ParameterFit) -> dict[str, Any]:
+    """List what a fit found, in MPa and mm."""
+    return {
+        "numbers": {name: float(value) for name, value in found.numbers.items()},
+        "std": {name: float(value) for name, value in found.std.items()},
+        "interval_95": {name: list(ends) for name, ends in found.intervals().items()},
+        "prior_share": {name: float(value) for name, value in found.prior_share.items()},
+        "correlation": np.asarray(found.correlation).tolist(),
+        "chi2": {name: float(value) for name, value in found.chi2.items()},
+        "data": {name: int(values.size) for name, values in found.residuals.items()},
+        "steps": found.steps,
+        "advice": found.advice(),
+    }
+
+
+def _dataset(found: ParameterFit) -> xr.Dataset:
+    """Label numbers, covariance and standardised residuals."""
+    names = list(found.names)
+    low, high = zip(*(found.intervals()[name] for name in names), strict=True)
+    each = {
+        "value": [float(found.numbers[name]) for name in names],
+        "std": [float(found.std[name]) for name in names],
+        "low": low,
+        "high": high,
+        "prior_share": [float(found.prior_share[name]) for name in names],
+    }
+    parts: dict[str, Any] = {name: ("parameter", list(values)) for name, values in each.items()}
+    parts["covariance"] = (("parameter", "other"), np.asarray(found.covariance))
+    for source, values in found.residuals.items():
+        parts[f"residual_{source}"] = (f"datum_{source}", np.asarray(values), {"units": "1"})
+    return xr.Dataset(parts, {"parameter": names, "other": names}, {"interval": "95 %", "units": "MPa, mm, 1"})
+
+
+def _show(found: ParameterFit, numbers: dict[str, Any], files: list[str], out: Path) -> None:
+    table = Table("number", "value", "std", "95 % interval", "of the prior's std")
+    for name in found.names:
+        low, high = numbers["interval_95"][name]
+        value, std, share = (numbers[key][name] for key in ("numbers", "std", "prior_share"))
+        table.add_row(name, f"{value:.4g}", f"{std:.2g}", f"{low:.4g} to {high:.4g}", f"{share:.1%}")
+    console = Console(highlight=False)
+    console.print(table)
+    for source, chi2 in numbers["chi2"].items():
+        console.print(f"χ² of {source}: {chi2:.4g} of {numbers['data'][source]} data", markup=False, soft_wrap=True)
+    for said in numbers["advice"]:
+        console.print(said, style="yellow", markup=False, soft_wrap=True)
+    console.print(f"Look at {out / FILES[0]} first. Wrote {', '.join(files)} to {out}", markup=False, soft_wrap=True)
