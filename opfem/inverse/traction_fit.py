@@ -52,6 +52,8 @@ _COMPILES = "the programs of a fit, about a minute the first time"
 _COMPILES_HALF = "the solver on half the mesh, about 10 s the first time"
 # Limits of CG iterations, without and with a fitted lateral traction (`FitSettings.cg_steps`).
 _CG_STEPS, _CG_STEPS_LATERAL = 60, 300
+# Change of the residuals at which a fit has converged, without and with fitted numbers (`FitSettings.rtol`).
+_RTOL, _RTOL_NUMBERS = 3e-2, 1e-2
 
 
 def fit_traction(
@@ -164,6 +166,7 @@ class _Run:
         """Iterate from unknowns until the fit converges or fails."""
         objective, settings = self.objective, self.settings
         limit = _CG_STEPS if objective.lateral is None else _CG_STEPS_LATERAL
+        rtol = _RTOL_NUMBERS if objective.parameters else _RTOL
         descent = PreconditionedDescent(
             fit_normal(objective.palpation, objective.surfaces, objective.prior),
             jnp.asarray(settings.cg_rtol),
@@ -173,7 +176,9 @@ class _Run:
         )
         # `atol` is a property, which optimistix declares as an argument.
         gauss_newton = GaussNewton(  # pyright: ignore[reportCallIssue]
-            rtol=jnp.asarray(settings.rtol), descent=descent, search=settings.line_search
+            rtol=jnp.asarray(rtol if settings.rtol is None else settings.rtol),
+            descent=descent,
+            search=settings.line_search,
         )
         state = gauss_newton.begin(white)
         result = FitStatus.max_steps_reached
