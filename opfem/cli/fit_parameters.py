@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from ..identification import ParameterFit, fit_parameters
 from ..io import netcdf_bytes, write_together
@@ -91,7 +91,7 @@ def _dataset(found: ParameterFit) -> xr.Dataset:
 
 
 def _show(found: ParameterFit, numbers: dict[str, Any], files: list[str], out: Path) -> None:
-    table = Table("number", "value", "std", "95 % interval", "of the prior's std")
+    table = Table(Column("number", no_wrap=True), "value", "std", "95 % interval", "of prior")
     for name in found.names:
         low, high = numbers["interval_95"][name]
         value, std, share = (numbers[key][name] for key in ("numbers", "std", "prior_share"))
