@@ -7,9 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.scipy.ndimage import map_coordinates
+from jaxtyping import Array
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import map_coordinates
 
 from ..inverse.measured_surface import interface_heights
 from ..measurement import ThicknessMap
@@ -54,13 +57,12 @@ def oct_scene(solution: Solution | ExperimentSolution, before: Solution | Experi
             f"{solution.displacement.shape}."
         )
     surface = _surface(before)
-    start = np.asarray(before.displacement)
-    step = np.asarray(solution.displacement) - start
-    positions = np.asarray(before.positions)
+    start, positions = before.displacement, before.positions
+    step = solution.displacement - start
 
     def increment(x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        points = np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in (x, y, z))))
-        moved = _at(step, _reference(points, positions, start), positions)
+        points = jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(c, float) for c in (x, y, z))))
+        moved = np.asarray(_moved(points, positions, start, step))
         return moved[0], moved[1], moved[2]
 
     return OctScene(surface, increment)
@@ -79,19 +81,24 @@ def _surface(solution: Solution | ExperimentSolution) -> ThicknessMap:
     return ThicknessMap(spline(fine_rows, fine_columns), extent=stated.extent)
 
 
-def _reference(points: np.ndarray, positions: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Find the reference points X that now lie at `points`: X = x - u(X), by fixed-point iteration."""
-    reference = points
-    for _ in range(_ITERATIONS):
-        closer = points - _at(displacement, reference, positions)
-        change = float(np.max(np.abs(closer - reference)))
-        reference = closer
-        if change < _CLOSE:
-            break
-    return reference
+@jax.jit
+def _moved(points: Array, positions: Array, displacement: Array, step: Array) -> Array:
+    """Interpolate a step at points that were displaced: at X = x - u(X), by fixed-point iteration."""
+
+    def unfinished(carry):
+        count, _, change = carry
+        return (count < _ITERATIONS) & (change >= _CLOSE)
+
+    def closer(carry):
+        count, reference, _ = carry
+        after = points - _at(displacement, reference, positions)
+        return count + 1, after, jnp.max(jnp.abs(after - reference))
+
+    begin = (0, points, jnp.asarray(jnp.inf, points.dtype))
+    return _at(step, jax.lax.while_loop(unfinished, closer, begin)[1], positions)
 
 
-def _at(field: np.ndarray, points: np.ndarray, positions: np.ndarray) -> np.ndarray:
+def _at(field: Array, points: Array, positions: Array) -> Array:
     """Interpolate a nodal field trilinearly at reference points; outside the layer its edge value holds."""
     _, nz, ny, nx = (count - 1 for count in positions.shape)
     x, y, z = points
@@ -99,4 +106,4 @@ def _at(field: np.ndarray, points: np.ndarray, positions: np.ndarray) -> np.ndar
     j = ny * (y - positions[1, 0, 0, 0]) / (positions[1, 0, -1, 0] - positions[1, 0, 0, 0])
     thickness = map_coordinates(positions[2, -1], [j, i], order=1, mode="nearest")
     k = nz * z / thickness
-    return np.stack([map_coordinates(part, [k, j, i], order=1, mode="nearest") for part in field])
+    return jnp.stack([map_coordinates(part, [k, j, i], order=1, mode="nearest") for part in field])
