@@ -63,6 +63,7 @@ def summary_of(found: ParameterFit) -> dict[str, Any]:
         "numbers": {name: float(value) for name, value in found.numbers.items()},
         "std": {name: float(value) for name, value in found.std.items()},
         "interval_95": {name: list(ends) for name, ends in found.intervals().items()},
+        "mesh_std": {name: float(value) for name, value in found.mesh_std.items()},
         "prior_share": {name: float(value) for name, value in found.prior_share.items()},
         "correlation": np.asarray(found.correlation).tolist(),
         "chi2": {name: float(value) for name, value in found.chi2.items()},
@@ -81,6 +82,7 @@ def _dataset(found: ParameterFit) -> xr.Dataset:
         "std": [float(found.std[name]) for name in names],
         "low": low,
         "high": high,
+        "mesh_std": [float(found.mesh_std[name]) for name in names],
         "prior_share": [float(found.prior_share[name]) for name in names],
     }
     parts: dict[str, Any] = {name: ("parameter", list(values)) for name, values in each.items()}
@@ -91,11 +93,11 @@ def _dataset(found: ParameterFit) -> xr.Dataset:
 
 
 def _show(found: ParameterFit, numbers: dict[str, Any], files: list[str], out: Path) -> None:
-    table = Table(Column("number", no_wrap=True), "value", "std", "95 % interval", "of prior")
+    table = Table(Column("number", no_wrap=True), "value", "std", "of it mesh", "95 % interval", "of prior")
     for name in found.names:
         low, high = numbers["interval_95"][name]
-        value, std, share = (numbers[key][name] for key in ("numbers", "std", "prior_share"))
-        table.add_row(name, f"{value:.4g}", f"{std:.2g}", f"{low:.4g} to {high:.4g}", f"{share:.1%}")
+        value, std, mesh, share = (numbers[key][name] for key in ("numbers", "std", "mesh_std", "prior_share"))
+        table.add_row(name, f"{value:.4g}", f"{std:.2g}", f"{mesh:.2g}", f"{low:.4g} to {high:.4g}", f"{share:.1%}")
     console = Console(highlight=False)
     console.print(table)
     for source, chi2 in numbers["chi2"].items():

@@ -3,6 +3,7 @@
 Thickness maps, forces and side bulges belong to one state; increments of axial displacement to two.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,37 +17,43 @@ from ..inverse.observations import ForceReading, SideBulge
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
 from ..solvers import Solution
+from .loaded_states import LoadedState
 
 # Fixed-point iterations for the reference position of a spatial point: at 40 % strain they reduce the error to 1e-8.
 _ITERATIONS = 20
 
 
 def residual(
-    observed: Any, state: int, states: tuple[Solution, ...], scale: Array, model_std: float
+    observed: Any, state: int, states: Sequence[LoadedState], scale: Array, model: Array
 ) -> Float[Array, " n"]:
     """Compute the residual of an observation: computed minus measured value over the standard deviation [-].
 
     Args:
         observed: A `ThicknessMap`, `ForceReading`, `AxialIncrement` or `SideBulge`.
         state: Number of the observed state; an increment has its own two.
-        states: The solved states.
+        states: What observations see of the solved states.
         scale: Factor of computed increments [-].
-        model_std: Standard deviation of computed increments [mm].
+        model: Standard deviation of the computed values over that of the measured ones [-].
     """
+    return _over_noise(observed, state, states, scale) / jnp.sqrt(1.0 + model**2)
+
+
+def _over_noise(observed: Any, state: int, states: Sequence[LoadedState], scale: Array) -> Float[Array, " n"]:
     if isinstance(observed, AxialIncrement):
         computed = scale * axial_increment(states[observed.before], states[observed.after], observed.points)
-        return (computed - observed.values) / jnp.sqrt(observed.std**2 + model_std**2)
-    solution = states[state]
+        return (computed - observed.values) / observed.std
+    seen = states[state]
     if isinstance(observed, ForceReading):
-        return jnp.atleast_1d((-solution.stats["force_sample"][2] - observed.force) / observed.std)
+        return jnp.atleast_1d((-seen.force[2] - observed.force) / observed.std)
     if isinstance(observed, SideBulge):
-        return (bulge(solution, observed.side, observed.depth) - observed.displacement) / observed.std
-    mesh = solution.palpation.mesh()
-    measured = project_map(mesh, observed, noise_std("fit_parameters", observed))
-    return measured.misfit(interface_heights(mesh, solution.displacement[:, -1])).ravel()
+        return (bulge(seen, observed.side, observed.depth) - observed.displacement) / observed.std
+    measured = project_map(seen.mesh, observed, noise_std("fit_parameters", observed))
+    return measured.misfit(interface_heights(seen.mesh, seen.displacement[:, -1])).ravel()
 
 
-def axial_increment(before: Solution, after: Solution, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+def axial_increment(
+    before: Solution | LoadedState, after: Solution | LoadedState, points: Float[Array, "n 3"]
+) -> Float[Array, " n"]:
     """Compute u_z(after) - u_z(before) [mm] at spatial points [mm] of the state before."""
     X, u = before.positions, before.displacement
     step = after.displacement[2] - u[2]
@@ -65,7 +72,7 @@ def axial_increment(before: Solution, after: Solution, points: Float[Array, "n 3
     return at(step, jax.lax.fori_loop(0, _ITERATIONS, closer, p))
 
 
-def bulge(solution: Solution, side: str, depth: Float[Array, " n"]) -> Float[Array, " n"]:
+def bulge(solution: Solution | LoadedState, side: str, depth: Float[Array, " n"]) -> Float[Array, " n"]:
     """Compute the outward displacement [mm] of the middle of a side at distances from the window [mm]."""
     axis, end = "xy".index(side[0]), -int(side[1])
     u = jnp.take(solution.displacement, end, axis=3 - axis)  # (3, nz+1, nodes along the side)

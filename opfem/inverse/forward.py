@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..model import Palpation, Traction
+from ..model import Load, Palpation, Traction
 from ..solvers import Solution
 from ..solvers.derivative import Handed, Slot, Solve, follow_path, linearised, pull, push
 from ..solvers.discretise import discretise
@@ -34,18 +34,18 @@ class TracedState(NamedTuple):
 
 
 class ForwardSolve(NamedTuple):
-    """Forward solve of the layer under a traction.
+    """Forward solve of the layer under a load.
 
     Attributes:
         palpation: The experiment.
-        load: The traction.
+        load: The load.
         problem: The discretised problem.
         end: State of the load stepping at its end.
         solves: Equilibrium solves of the accepted increments.
     """
 
     palpation: Palpation
-    load: Traction
+    load: Load
     problem: Problem
     end: Stepping
     solves: list[Solve]
@@ -55,17 +55,19 @@ class ForwardSolve(NamedTuple):
         return judged(finish(self.problem, resume(self.problem, self.end, solver), self.palpation, self.load))
 
 
-def forward_solve(palpation: Palpation, load: Traction, solver: Newton) -> ForwardSolve:
-    """Solve under a traction, increment by increment, by the program that all solves of this mesh share.
+def forward_solve(palpation: Palpation, load: Load, solver: Newton, start: ForwardSolve | None = None) -> ForwardSolve:
+    """Solve under a load, increment by increment, by the program that all solves of this mesh share.
 
     It stops where the path is longer than `Newton.max_path`, solves of a snap-through included.
 
     Args:
         palpation: The experiment.
-        load: The traction.
+        load: The load.
         solver: Settings.
+        start: Solve to continue from; None: from rest.
     """
-    problem, s = prepare(palpation, load, None, solver, None, False)
+    before, state = (None, None) if start is None else (start.load, start.end.state)
+    problem, s = prepare(palpation, load, before, solver, state, False)
     solves: list[Solve] = []
     while bool(unfinished(s)) and int(s.path.length) <= solver.max_path:
         before, s = s, compiled_attempt(problem, s, solver)

@@ -128,10 +128,12 @@ def linearised(problem: Problem, solves: Sequence[Solve]) -> list[Slot]:
     return [Slot(solve, linearise(problem, solve), jnp.asarray(rtol)) for solve, rtol in pairs]
 
 
-def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed, settings: Newton) -> Handed:
-    """Compute the change of the path's end, to 3e-4, by one linear solve per slot.
+def push(
+    problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed, settings: Newton, rtol: float | None = None
+) -> Handed:
+    """Compute the change of the path's end, by default to 3e-4, by one linear solve per slot.
 
-    For loads only: one correction is not accurate for changes of prescribed displacements.
+    That suffices for loads only: one solve is not accurate for changes of prescribed displacements.
 
     Args:
         problem: The problem.
@@ -139,11 +141,18 @@ def push(problem: Problem, slots: Sequence[Slot], moved: Problem, first: Handed,
         moved: Change of the problem; None for constant leaves.
         first: Change of the initial state.
         settings: Settings of the solve.
+        rtol: Relative residual to which linear solves are repeated (iterative refinement); outside of traces only.
     """
 
     def through(change: Handed, slot: Slot) -> Handed:
         off = _off_balance(problem, slot.solve, moved, change)
         step = _solve_kept(problem, slot, off, jnp.asarray(False), settings)
+        for _ in range(0 if rtol is None else _MOST_CORRECTIONS):
+            left, relative = _remaining(problem, slot.solve, off, step)
+            if not relative > rtol:
+                break
+            more = _solve_kept(problem, slot, left, jnp.asarray(False), settings)
+            step = jax.tree.map(jnp.add, step, more)
         return _hand_on(problem, slot.solve, moved, change, step)
 
     return _through(through, first, slots)
@@ -235,6 +244,20 @@ def _off_balance(problem: Problem, solve: Solve, moved: Problem, change: Handed)
     """Compute the negative change of the residual at the solved state: right-hand side of the linear solve."""
     equations = _Equations(problem, solve, moved)
     return jax.tree.map(jnp.negative, jax.jvp(equations.balance, equations.at, (moved, change))[1])
+
+
+@QuickJit
+def _remaining(problem: Problem, solve: Solve, off: Unknowns, step: Unknowns) -> tuple[Unknowns, Array]:
+    """Compute what a step leaves of a right-hand side, and its relative size."""
+    after = solve.after
+    slowed = eqx.tree_at(lambda p: p.viscosity, problem, solve.viscosity)
+
+    def balance(x):
+        return slowed.balance(x, after.fraction, solve.before, after.hold_active)
+
+    left = jax.tree.map(jnp.subtract, off, jax.jvp(balance, (after.unknowns,), (step,))[1])
+    size = problem.size(off)
+    return left, problem.size(left) / jnp.where(size > 0, size, 1.0)
 
 
 @QuickJit
