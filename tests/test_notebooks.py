@@ -27,6 +27,13 @@ PRINTED = {
         r"pressure inside: difference 0\.\d\d%",
         r"kinetic 0\.\d\d%, missing 0\.\d+%",
     ],
+    "friction": [
+        r"9\d% of the samples known, std \d\.\d nm",
+        r"window\.friction      0\.(19|20|21)\d*, 95 %",
+        r"sample\.friction      0\.0[78]\d*, 95 %",
+        r"sample\.friction is prior-dominated",
+        r"error of the peak: [+-]0\.[0-2]\d\d kPa, without friction -1\.\d",
+    ],
     "oct": [
         r"interface: bias [+-]0\.[0-3]\d µm, rms 0\.\d\d µm",
         r"its std: 9[0-8]% of pixels within two",
