@@ -230,13 +230,12 @@ def test_frictions_from_phase_and_force(frictions):
             "sample.friction": op.LogNormal(0.05, 0.7),
             "layer.material.bulk": op.LogNormal(0.15, 0.5),
         },
+        model_std=0.0,  # the increments are of this mesh
     )
     expected = {"window.friction": frictions[0], "sample.friction": frictions[1], "layer.material.bulk": 0.11732}
     for name, value in (expected | {"scale": 1.005}).items():
         assert abs(float(found.numbers[name]) - value) < 3.0 * float(found.std[name])
-    # The increments are of this mesh: its error, which standard deviations and weights count in, is not in them.
-    assert 0.0 < float(found.mesh_std["window.friction"]) < float(found.std["window.friction"])
-    assert float(found.chi2["phase"]) < 1.5 * len(POINTS)
+    assert float(found.chi2["phase"]) == pytest.approx(len(POINTS), rel=0.5)
 
 
 @pytest.mark.slow
