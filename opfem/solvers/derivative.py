@@ -9,6 +9,7 @@ of one Jacobian: they store the tangents, solve to the accuracy that this needs,
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -123,8 +124,8 @@ def linearise(problem: Problem, solve: Solve) -> Tangent:
 
 def linearised(problem: Problem, solves: Sequence[Solve]) -> list[Slot]:
     """Linearise the solves of a path."""
-    tolerances = [_KEPT_EARLIER_RTOL] * (len(solves) - 1) + [_KEPT_RTOL]
-    pairs = zip(solves, tolerances, strict=True)
+    earlier = [_KEPT_EARLIER_RTOL] * (len(solves) - 1)
+    pairs = itertools.zip_longest(solves, earlier, fillvalue=_KEPT_RTOL)
     return [Slot(solve, linearise(problem, solve), jnp.asarray(rtol)) for solve, rtol in pairs]
 
 
