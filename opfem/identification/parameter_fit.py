@@ -97,7 +97,7 @@ def fit_parameters(
     pairs = _pairs(observations)
     if not callable(experiment):
         require_float64("fit_parameters", palpation=experiment[0])
-        check_parameters(experiment[0], parameters)
+        check_parameters("fit_parameters", experiment[0], parameters)
     increments = [observed for _, observed in pairs if isinstance(observed, AxialIncrement)]
     if scale is None and increments:
         scale = Normal(1.0, max(float(one.scale_std) for one in increments))

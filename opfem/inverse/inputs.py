@@ -70,7 +70,7 @@ def check_inputs(
         )
     for m in maps:
         check_against_layer("fit_traction.thickness", m, palpation.layer.thickness, palpation.extent, 4)
-    check_parameters(palpation, parameters)
+    check_parameters("fit_traction", palpation, parameters)
     nx, ny, nz = palpation.elements
     if min(nx, ny) < 4:
         raise ValueError(f"fit_traction needs at least 4 elements along x and y, got {(nx, ny)}.")

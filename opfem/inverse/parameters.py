@@ -90,13 +90,12 @@ def with_numbers(palpation: Palpation, numbers: Mapping[str, ScalarLike]) -> Pal
     return eqx.tree_at(lambda p: p.layer.thickness, palpation, changed)
 
 
-def check_parameters(palpation: Palpation, parameters: Mapping[str, Any]) -> None:
+def check_parameters(caller: str, palpation: Palpation, parameters: Mapping[str, Any]) -> None:
     """Raise ValueError unless every name is a number of the experiment, and every value a prior of it."""
     for name, prior in parameters.items():
         if not isinstance(prior, AbstractNumberPrior):
             raise ValueError(
-                f"fit_traction: parameters[{name!r}] must be Normal(mean, std) or LogNormal(median, spread), got "
-                f"{prior!r}."
+                f"{caller}: parameters[{name!r}] must be Normal(mean, std) or LogNormal(median, spread), got {prior!r}."
             )
         if name in (INDEX, OFFSET):
             continue
@@ -106,7 +105,7 @@ def check_parameters(palpation: Palpation, parameters: Mapping[str, Any]) -> Non
             value = None
         if value is None or not eqx.is_inexact_array(value) or value.ndim != 0:
             raise ValueError(
-                f"fit_traction: parameters name numbers of the experiment by their path, such as 'layer.material.c10', "
+                f"{caller}: parameters name numbers of the experiment by their path, such as 'layer.material.c10', "
                 f"'window.friction', or {INDEX!r} and {OFFSET!r}; got {name!r}."
             )
 

@@ -9,7 +9,6 @@ of one Jacobian: they store the tangents, solve to the accuracy that this needs,
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -124,8 +123,7 @@ def linearise(problem: Problem, solve: Solve) -> Tangent:
 
 def linearised(problem: Problem, solves: Sequence[Solve]) -> list[Slot]:
     """Linearise the solves of a path."""
-    earlier = [_KEPT_EARLIER_RTOL] * (len(solves) - 1)
-    pairs = itertools.zip_longest(solves, earlier, fillvalue=_KEPT_RTOL)
+    pairs = [*((solve, _KEPT_EARLIER_RTOL) for solve in solves[:-1]), *((solve, _KEPT_RTOL) for solve in solves[-1:])]
     return [Slot(solve, linearise(problem, solve), jnp.asarray(rtol)) for solve, rtol in pairs]
 
 

@@ -158,7 +158,7 @@ def test_what_is_refused(linear, solution):
         op.fit_parameters(experiment, [observed], PRIORS, max_steps=1)
     with pytest.raises(ValueError, match="two lists of one length"):
         op.SideBulge("x0", [0.1, 0.2], [0.0], 1e-3)
-    with pytest.raises(ValueError, match="parameters name numbers"):
+    with pytest.raises(ValueError, match="fit_parameters: parameters name numbers"):
         op.fit_parameters((solution.palpation, [solution.load]), [observed], {"window.grip": op.Normal(1.0, 1.0)})
 
 
