@@ -29,9 +29,17 @@ def profile(strain: float, wave: float):
 
 def volumes(displacement, seed: int, snr: float, shape=SHAPE):
     return op.simulate_oct(
-        op.UWA_845NM, lambda x, y: np.full_like(x, DEPTH), key=jax.random.key(seed), spacing=(STEP, STEP), shape=shape,
-        depth=DEPTH, depth_spacing=DEPTH_SPACING, increment=lambda x, y, z: (0 * z, 0 * z, displacement(z)), media=MEDIA, snr=snr,
-    )  # fmt: skip
+        op.UWA_845NM,
+        lambda x, y: np.full_like(x, DEPTH),
+        key=jax.random.key(seed),
+        spacing=(STEP, STEP),
+        shape=shape,
+        depth_spacing=DEPTH_SPACING,
+        depth=DEPTH,
+        increment=lambda x, y, z: (0 * z, 0 * z, displacement(z)),
+        media=MEDIA,
+        snr=snr,
+    )
 
 
 def with_window(before: op.OctVolume, after: op.OctVolume, seed: int):

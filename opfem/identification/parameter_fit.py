@@ -7,6 +7,7 @@ number. The error of the mesh is estimated near the optimum and followed into th
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -114,7 +115,13 @@ def fit_parameters(
         if estimates and found.converged:
             bar.stage("mesh error", compiles=_COMPILES)
             errors = fit.mesh_error(found)
-            if errors is not None:
+            if errors is None:
+                warnings.warn(
+                    "fit_parameters: the states cannot be solved on a finer mesh, so that the standard deviations do "
+                    "not include the error of the mesh. Give it as model_std [mm].",
+                    stacklevel=2,
+                )
+            else:
                 fit = dataclasses.replace(fit, model=[jnp.sqrt(jnp.mean(one**2)) for one in errors])
                 errors = [one / jnp.hypot(1.0, m) for one, m in zip(errors, fit.model, strict=True)]
             bar.stage("fit with mesh error")
@@ -122,20 +129,32 @@ def fit_parameters(
             found = last._replace(steps=found.steps + last.steps)
         path = fit.solve(found.white)
     if throw and not found.converged:
+        why, remedy = f"within max_steps={max_steps} steps", "Raise the limit"
+        if found.stalled:
+            why, remedy = "though no step reduces the misfit any more", "Solve with a smaller rtol"
         raise FitError(
-            f"fit_parameters did not converge within max_steps={max_steps} steps. Raise the limit, or centre the "
-            "priors closer to the true values."
+            f"fit_parameters did not converge {why}. {remedy}, or centre the priors closer to the true values."
         )
     return _fitted(fit, found, errors, path)
 
 
 class _Optimum(NamedTuple):
-    """Where an iteration ended: white numbers, residuals and Jacobian; whether it converged, and in how many steps."""
+    """Where an iteration ended.
+
+    Attributes:
+        white: White numbers.
+        residual: Residuals there [-].
+        J: Their derivative.
+        converged: Whether it converged.
+        stalled: Whether no step reduced the misfit.
+        steps: Number of steps.
+    """
 
     white: Array
     residual: Array
     J: Array
     converged: bool
+    stalled: bool
     steps: int
 
 
@@ -216,7 +235,7 @@ class _Fit:
         here = _linearised(self.residuals(white, path.states()), self.jacobian(white, path))
         first = search.init(white, here)
         trust = eqx.tree_at(lambda s: s.step_size, first, 1.0 / jnp.mean(here.residual**2))
-        steps, refused, ended = 0, 0, False
+        steps, refused, ended, stalled = 0, 0, False, False
         while not ended and steps < self.max_steps:
             step, trust = _limited_step(here, trust)
             path, steps = self.solve(white + step), steps + 1
@@ -234,15 +253,14 @@ class _Fit:
             unexplained = max(1.0, float(np.sqrt(2.0 * misfit / here.residual.size)))
             converged = left <= (_STALLED * unexplained if stalled else rtol)
             ended = converged or stalled or (rough and left**2 <= 2.0 * _ROUGH**2 * misfit)
-        return _Optimum(white, here.residual, here.jac.as_matrix(), converged or (rough and ended), steps)
+        return _Optimum(white, here.residual, here.jac.as_matrix(), converged or (rough and ended), stalled, steps)
 
     def mesh_error(self, found: _Optimum) -> list[Array] | None:
         """Estimate the mesh error of each observation's residuals [-], by Richardson extrapolation of second order.
 
-        None where a function solves, or the solve on the finer mesh fails.
+        None where the solve on the finer mesh fails.
         """
-        if callable(self.experiment):
-            return None
+        assert not callable(self.experiment)
         palpation, loads = self.experiment
         even = 2 if palpation.element == "tet10" else 1
         elements = tuple(even * int(np.ceil(_FINER * n / even)) for n in palpation.elements)

@@ -53,12 +53,12 @@ def test_derivative_by_a_number():
 @pytest.mark.parametrize("name", ["window.fraction", "elements", "layer", "layer.material", "c10"])
 def test_unknown_names_are_refused(name):
     with pytest.raises(ValueError, match=rf"such as 'layer\.material\.c10'.*got '{name}'"):
-        check_parameters(palpation(), {name: op.Normal(1.0, 0.1)})
+        check_parameters("fit_traction", palpation(), {name: op.Normal(1.0, 0.1)})
 
 
 def test_a_bare_number_is_no_prior():
     with pytest.raises(ValueError, match=r"parameters\['window\.friction'\] must be Normal\(mean, std\)"):
-        check_parameters(palpation(), {"window.friction": 0.1})
+        check_parameters("fit_traction", palpation(), {"window.friction": 0.1})
 
 
 @pytest.mark.parametrize(
