@@ -154,7 +154,9 @@ def deck_case(path: Path, draw: int):
     scale = 1.0 + SCALE_STD * rng.standard_normal()
     observations = [increment(truth, points(thickness, side), rng, scale), force(truth[0], rng)]
     material = palpation.layer.material
-    guessed = eqx.tree_at(lambda p: (p.window.contact.friction, p.sample.contact.friction), palpation, (0.15, 0.05))
+    guessed = eqx.tree_at(
+        lambda p: (p.window.friction, p.sample.friction), palpation, (jnp.asarray(0.15), jnp.asarray(0.05))
+    )
     if not isinstance(material, op.MooneyRivlin):
         raise ValueError(f"{path.name} holds no Mooney–Rivlin material.")
     c10 = float(material.c10)
