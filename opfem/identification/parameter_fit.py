@@ -2,7 +2,8 @@
 
 States are solved in sequence, each from the previous one. Levenberg–Marquardt steps of optimistix fit a few white
 numbers, on the host, so that all states share the solver's compiled programs. The Jacobian is dense, a column per
-number. The error of the mesh is estimated near the optimum and followed into the numbers.
+number. First steps are on a coarser mesh, whose difference to the experiment's tells the error of the mesh; it is
+followed into the numbers.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ from ..model import Load, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
-from .levenberg_marquardt import Optimum, minimise
+from .levenberg_marquardt import Optimum, minimise, undamped_step
 from .loaded_states import LoadedState, LoadPath, SolvedStates, can_follow, follow
 from .result import SCALE, ParameterFit
 from .state_residuals import residual, source_of
@@ -34,9 +35,9 @@ from .state_residuals import residual, source_of
 _COMPILES = "the solver, about 10 s the first time"
 _COMPILES_DERIVATIVE = "the solver's derivative, about 15 s the first time"
 _INSENSITIVE = 1e-3  # norm of a Jacobian column over the largest one, below which the data do not depend on a number
-# Elements of the finer mesh over those of the fit, along each axis. The increment of a layer on 20×20×4 elements is
-# 7.1 nm off. From 1.5 times as many follow 10.2 nm, of correlation 0.94 with it; from half as many 11.6 nm, of -0.04.
-_FINER = 1.5
+# Elements of the mesh over those of the coarser one, along each axis. On 15×15×6 elements increments are 1.2 to 2.6 nm
+# off for frictions up to 0.2, and 7.8 nm for 0.3 and 0.2; 10×10×4 tell 2.0 to 4.6, and 10.8 nm.
+_COARSER = 1.5
 # Points of the priors, the best of which is the second start. From the medians 0.15 and 0.05, the fit of frictions 0.3
 # and 0.2 ends in a local optimum without friction at the sample. The best as the first start is no better: 0.2 and 0.08
 # then end at 0.56 and 0.
@@ -72,11 +73,11 @@ def fit_parameters(
         scale: Prior of the factor of increments, fitted as "scale" where there are any; None: of mean 1 and of the
             largest `scale_std` of the increments.
         model_std: Standard deviation of computed increments due to the mesh [mm]. None: the mesh error of all computed
-            values is estimated by a solve on 1.5 times as many elements along each axis; it is 0 where a function
-            solves.
+            values is estimated from one of two thirds of the elements along each axis, on which the fit begins. It is 0
+            where a function solves.
         solver: Settings of the solves; a looser `rtol` changes increments by as much as the phase resolves.
-        rtol: Error of the numbers over their standard deviations at which the fit has converged [-]; 0.5 suffices where
-            no step reduces the misfit any more, because of the error of the solves.
+        rtol: Error of the numbers over their standard deviations at which the fit has converged [-]. Where no step
+            reduces the misfit any more, up to 2 suffices and is added to the standard deviations.
         max_steps: Limit of steps, shortened ones included.
         throw: Whether to raise where the fit does not converge.
         progress: Whether to show progress on a terminal, in a notebook or in a log.
@@ -93,42 +94,86 @@ def fit_parameters(
     if scale is None and increments:
         scale = Normal(1.0, max(float(one.scale_std) for one in increments))
     priors = {**parameters, **({SCALE: scale} if scale is not None and increments else {})}
-    fit = _Fit(experiment, pairs, priors, [_ratio(observed, model_std) for _, observed in pairs], solver, max_steps)
+    model = [_ratio(observed, model_std) for _, observed in pairs]
+    fit = _Fit(experiment, pairs, priors, model, solver)
+    coarse = fit.on_coarser_mesh() if model_std is None else None
     with Progress(progress) as bar:
         bar.stage("states at the priors' medians", compiles=_COMPILES)
         white = jnp.zeros(len(priors))
-        _check_first(pairs, fit.solve(white))
-        bar.stage("fit of numbers", compiles=_COMPILES_DERIVATIVE)
-        estimates = model_std is None and not callable(experiment)
-        fitted = fit.optimum_and_mesh_error(white, rtol, bar, estimates)
-        if not fitted.found.converged or float(jnp.mean(fitted.found.residual**2)) > _UNEXPLAINED:
-            bar.stage("fit from another point of the priors")
-            other = fit.optimum_and_mesh_error(fit.other_start(), rtol, bar, estimates)
-            fitted = min(fitted, other, key=lambda one: (not one.found.converged, one.found.misfit))
-        fit, found, errors = fitted
-        if estimates and found.converged and errors is None:
+        path = (coarse or fit).solve(white)
+        if coarse and not path.reached:
             warnings.warn(
-                "fit_parameters: the states cannot be solved on a finer mesh, so that the standard deviations do not "
+                "fit_parameters: the states cannot be solved on a coarser mesh, so that the standard deviations do not "
                 "include the error of the mesh. Give it as model_std [mm].",
                 stacklevel=2,
             )
-        path = fit.solve(found.white)
+            coarse, path = None, fit.solve(white)
+        _check_first(pairs, path)
+        bar.stage("fit of numbers", compiles=_COMPILES_DERIVATIVE)
+        fitted = _minimised(fit, coarse, white, path, rtol, max_steps, bar)
+        if not fitted.found.converged or float(jnp.mean(fitted.found.residual**2)) > _UNEXPLAINED:
+            bar.stage("points of the priors")
+            white, path = (coarse or fit).other_start(bar)
+            bar.stage("fit from the best of them")
+            other = _minimised(fit, coarse, white, path, rtol, max_steps, bar)
+            steps = fitted.found.steps + other.found.steps
+            fitted = min(fitted, other, key=lambda one: (not one.found.converged, one.found.misfit))
+            fitted = fitted._replace(found=fitted.found._replace(steps=steps))
+    found = fitted.found
     if throw and not found.converged:
         why, remedy = f"within max_steps={max_steps} steps", "Raise the limit"
         if found.stalled:
             why, remedy = "though no step reduces the misfit any more", "Solve with a smaller rtol"
+        if not fitted.path.reached:
+            why, remedy = f"on the mesh of the experiment: {fitted.path.failure}", "Take a finer mesh"
         raise FitError(
             f"fit_parameters did not converge {why}. {remedy}, or centre the priors closer to the true values."
         )
-    return _fitted(fit, found, errors, path)
+    return _result(*fitted)
 
 
 class _Fitted(NamedTuple):
-    """A fit with its weights, its optimum, and the mesh error of each observation's residuals [-], if estimated."""
+    """A fit with its weights, its optimum, and the states there on the experiment's mesh."""
 
     fit: "_Fit"
     found: Optimum
-    errors: list[Array] | None
+    path: LoadPath | SolvedStates
+
+
+def _minimised(
+    fit: "_Fit",
+    coarse: "_Fit | None",
+    white: Array,
+    path: LoadPath | SolvedStates,
+    rtol: float,
+    max_steps: int,
+    bar: Progress,
+) -> _Fitted:
+    """Minimise on a coarser mesh first, then on the experiment's, with the mesh error among the weights of both.
+
+    Args:
+        fit: The fit on the experiment's mesh.
+        coarse: The same on a coarser one; None: steps are on the experiment's alone.
+        white: The first point.
+        path: States there, on the coarser mesh if there is one.
+        rtol: Error of the numbers over their standard deviations at which it ends [-].
+        max_steps: Limit of steps.
+        bar: Progress.
+    """
+    steps = 0
+    if coarse is not None:
+        bar.stage("mesh error", compiles=_COMPILES)
+        coarse = coarse.weighted(fit, white, path, fit.solve(white))
+        bar.stage("fit on a coarser mesh", compiles=_COMPILES_DERIVATIVE)
+        start = minimise(coarse, white, path, rtol, max_steps, bar)
+        bar.stage("mesh error")
+        white, path, steps = start.white, fit.solve(start.white), start.steps
+        if not path.reached:
+            return _Fitted(coarse, start._replace(converged=False), path)
+        fit = fit.weighted(coarse, white, path, start.path)
+    bar.stage("fit of numbers", compiles=_COMPILES_DERIVATIVE)
+    found = minimise(fit, white, path, rtol, max_steps - steps, bar)
+    return _Fitted(fit, found._replace(steps=steps + found.steps), found.path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +186,7 @@ class _Fit:
         priors: Priors of the numbers, by name.
         model: For each observation, the standard deviation of computed values over that of the measured ones [-].
         solver: Settings of the solves.
-        max_steps: Limit of steps.
+        errors: Estimated mesh error of each observation's computed values, over the same [-]; none: not estimated.
     """
 
     experiment: Experiment
@@ -149,7 +194,7 @@ class _Fit:
     priors: dict[str, AbstractNumberPrior]
     model: list[Array]
     solver: Newton
-    max_steps: int
+    errors: tuple[Array, ...] = ()
 
     def numbers(self, white: Array) -> dict[str, Array]:
         """Return the numbers by name."""
@@ -170,12 +215,15 @@ class _Fit:
         solved = functools.partial(_solved, palpation, loads, self.solver)
         return SolvedStates(solved, numbers, solved(numbers))
 
+    def over_noise(self, white: Array, states: Sequence[LoadedState]) -> list[Array]:
+        """Compute computed minus measured values of each observation over the noise [-]."""
+        factor = self.numbers(white).get(SCALE, jnp.ones(()))
+        return [residual(observed, state, states, factor) for state, observed in self.pairs]
+
     def parts(self, white: Array, states: Sequence[LoadedState]) -> list[Array]:
         """Compute the residuals of each observation [-]."""
-        factor = self.numbers(white).get(SCALE, jnp.ones(()))
         return [
-            residual(observed, state, states, factor, model)
-            for (state, observed), model in zip(self.pairs, self.model, strict=True)
+            one / jnp.hypot(1.0, model) for one, model in zip(self.over_noise(white, states), self.model, strict=True)
         ]
 
     def residuals(self, white: Array, states: Sequence[LoadedState]) -> Array:
@@ -192,58 +240,79 @@ class _Fit:
 
         return jax.vmap(column, out_axes=1)(basis, path.changes(directions))
 
-    def optimum_and_mesh_error(self, white: Array, rtol: float, bar: Progress, estimates: bool) -> "_Fitted":
-        """Minimise from a point, with the mesh error among the weights where it is estimated.
+    def covariances(self, J: Array) -> tuple[Array, Array]:
+        """Compute the covariance of the white numbers without the mesh error, and that of their changes with it.
 
-        Args:
-            white: The first point.
-            rtol: Error of the numbers over their standard deviations at which it ends [-].
-            bar: Progress.
-            estimates: Whether the mesh error is estimated.
+        The estimate is more certain in its size than in its pattern. Where its parts have opposite effects on a number,
+        the change with all of it is too small: the changes with its part in each region are added, as if independent.
         """
-        found = minimise(self, white, rtol, self.max_steps, bar, rough=estimates)
-        if not (estimates and found.converged):
-            return _Fitted(self, found, None)
-        bar.stage("mesh error", compiles=_COMPILES)
-        fit, errors = self, self.mesh_error(found)
-        if errors is not None:
-            fit = dataclasses.replace(self, model=[jnp.sqrt(jnp.mean(one**2)) for one in errors])
-            errors = [one / jnp.hypot(1.0, m) for one, m in zip(errors, fit.model, strict=True)]
-        bar.stage("fit with mesh error")
-        last = minimise(fit, found.white, rtol, self.max_steps, bar)
-        return _Fitted(fit, last._replace(steps=found.steps + last.steps), errors)
+        inverse = jnp.linalg.inv(J.T @ J)
+        if not self.errors:
+            return inverse, jnp.zeros_like(inverse)
+        regions = []
+        for place, ((_, observed), one) in enumerate(zip(self.pairs, self.errors, strict=True)):
+            region = jnp.full(one.size, 8 * place)
+            if isinstance(observed, AxialIncrement):  # octants
+                upper = observed.points > jnp.median(observed.points, axis=0)
+                region += upper.astype(int) @ jnp.array([1, 2, 4])
+            regions.append(region)
+        errors = [one / jnp.hypot(1.0, model) for one, model in zip(self.errors, self.model, strict=True)]
+        change = inverse @ J[: -len(inverse)].T * jnp.concatenate(errors)
+        each = jax.ops.segment_sum(change.T, jnp.concatenate(regions), 8 * len(regions))
+        whole = jnp.sum(each, axis=0)
+        return inverse, each.T @ each + whole * whole[:, None]
 
-    def other_start(self) -> Array:
-        """Return the point of lowest misfit among a few that are spread over the priors, or their medians.
+    def covariance(self, J: Array) -> Array:
+        """Compute the posterior covariance of the white numbers."""
+        without, mesh = self.covariances(J)
+        return without + mesh
+
+    def other_start(self, bar: Progress) -> tuple[Array, LoadPath | SolvedStates]:
+        """Return the point of lowest misfit among a few that are spread over the priors, with its states.
 
         The scale stays at its median: its prior is narrow, but moves all increments by more than their noise.
         """
         spread = jnp.asarray([name != SCALE for name in self.priors], float)
-        points = spread * _spread_over_normal(_STARTS, spread.size)
-
-        def misfit(point: Array) -> float:
+        best, least, states = jnp.zeros_like(spread), np.inf, None
+        for number, point in enumerate(spread * _spread_over_normal(_STARTS, spread.size)):
             path = self.solve(point)
-            return float(jnp.sum(self.residuals(point, path.states()) ** 2)) if path.reached else np.inf
+            misfit = float(jnp.sum(self.residuals(point, path.states()) ** 2)) if path.reached else np.inf
+            bar.show(f"point {number + 1} of {_STARTS}, misfit {misfit:.5g}")
+            if misfit < least:
+                best, least, states = point, misfit, path
+        return best, states or self.solve(best)
 
-        return min([*points, jnp.zeros_like(spread)], key=misfit)
-
-    def mesh_error(self, found: Optimum) -> list[Array] | None:
-        """Estimate the mesh error of each observation's residuals [-], by Richardson extrapolation of second order.
-
-        None where the solve on the finer mesh fails.
-        """
-        assert not callable(self.experiment)
+    def on_coarser_mesh(self) -> "_Fit | None":
+        """Return the fit on fewer elements; None where a function solves, or there are none to leave out."""
+        if callable(self.experiment):
+            return None
         palpation, loads = self.experiment
         even = 2 if palpation.element == "tet10" else 1
-        elements = tuple(even * int(np.ceil(_FINER * n / even)) for n in palpation.elements)
-        finer = dataclasses.replace(self, experiment=(dataclasses.replace(palpation, elements=elements), loads))
-        path = finer.solve(found.white)
-        if not path.reached:
+        elements = tuple(even * int(np.ceil(n / (_COARSER * even))) for n in palpation.elements)
+        if elements == palpation.elements:
             return None
-        there = finer.parts(found.white, path.states())
-        here = jnp.split(found.residual, np.cumsum([one.size for one in there]))[:-1]
-        ratio = float(np.prod(palpation.elements) / np.prod(elements)) ** (1.0 / 3.0)
-        return [(a - b) / (1.0 - ratio**2) for a, b in zip(here, there, strict=True)]
+        return dataclasses.replace(self, experiment=(dataclasses.replace(palpation, elements=elements), loads))
+
+    def weighted(
+        self, other: "_Fit", white: Array, here: LoadPath | SolvedStates, there: LoadPath | SolvedStates
+    ) -> "_Fit":
+        """Return the fit with the mesh error among its weights, estimated by Richardson extrapolation of second order.
+
+        Args:
+            other: The fit on another mesh.
+            white: The point of the estimate.
+            here: States there.
+            there: The same on the other mesh; where they are not reached, the fit stays as it is.
+        """
+        if not there.reached:
+            return self
+        assert not callable(self.experiment)
+        assert not callable(other.experiment)
+        count, others = (np.prod(palpation.elements) for palpation in (self.experiment[0], other.experiment[0]))
+        share = 1.0 - float(count / others) ** (2.0 / 3.0)
+        values = zip(self.over_noise(white, here.states()), other.over_noise(white, there.states()), strict=True)
+        errors = tuple((a - b) / share for a, b in values)
+        return dataclasses.replace(self, errors=errors, model=[jnp.sqrt(jnp.mean(one**2)) for one in errors])
 
 
 def _spread_over_normal(count: int, size: int) -> Array:
@@ -315,49 +384,26 @@ def _check_first(pairs: list[tuple[int, Any]], path: LoadPath | SolvedStates) ->
                 )
 
 
-def _fitted(fit: _Fit, found: Optimum, errors: list[Array] | None, path: LoadPath | SolvedStates) -> ParameterFit:
+def _result(fit: _Fit, found: Optimum, path: LoadPath | SolvedStates) -> ParameterFit:
     white, J, names = found.white, found.J, tuple(fit.priors)
-    parts = fit.parts(white, path.states())
     data = J[: -len(names)]
     columns = np.asarray(jnp.sqrt(jnp.sum(data**2, axis=0)))
-    inverse = jnp.linalg.inv(J.T @ J)
-    mesh = jnp.zeros_like(inverse) if errors is None else _of_mesh_error(fit, inverse @ data.T, errors)
+    covariance, mesh_covariance = fit.covariances(J)
+    if found.stalled:
+        step = undamped_step(found.residual, J)
+        mesh_covariance += step * step[:, None]
     by_source: dict[str, list[Array]] = {}
-    for (_, observed), values in zip(fit.pairs, parts, strict=True):
+    for (_, observed), values in zip(fit.pairs, fit.parts(white, found.path.states()), strict=True):
         by_source.setdefault(source_of(observed), []).append(values)
     return ParameterFit(
         names=names,
         priors=fit.priors,
         white=white,
-        white_covariance=inverse,
-        white_mesh_covariance=mesh,
+        white_covariance=covariance,
+        white_mesh_covariance=mesh_covariance,
         insensitive=tuple(np.array(names)[columns <= _INSENSITIVE * columns.max()].tolist()),
         residuals={name: jnp.concatenate(values) for name, values in by_source.items()},
         solutions=path.solutions(),
         converged=found.converged,
         steps=found.steps,
     )
-
-
-def _of_mesh_error(fit: _Fit, response: Array, errors: list[Array]) -> Array:
-    """Compute the covariance of the white numbers' changes with the mesh error.
-
-    The estimate is more certain in its size than in its pattern. Where its parts have opposite effects on a number, the
-    change with all of it is too small: the changes with its part in each region are added, as if independent.
-
-    Args:
-        fit: The fit.
-        response: Change of the white numbers with each residual, `(k, n)`.
-        errors: Mesh error of each observation's residuals [-].
-    """
-    regions = []
-    for (_, observed), one in zip(fit.pairs, errors, strict=True):
-        region = jnp.zeros(one.size, int)
-        if isinstance(observed, AxialIncrement):  # octants
-            upper = observed.points > jnp.median(observed.points, axis=0)
-            region = upper.astype(int) @ jnp.array([1, 2, 4])
-        regions.append(region + 8 * len(regions))
-    change = response * jnp.concatenate(errors)
-    each = jax.ops.segment_sum(change.T, jnp.concatenate(regions), 8 * len(regions))
-    whole = jnp.sum(each, axis=0)
-    return each.T @ each + whole * whole[:, None]

@@ -23,9 +23,7 @@ from .loaded_states import LoadedState
 _ITERATIONS = 20
 
 
-def residual(
-    observed: Any, state: int, states: Sequence[LoadedState], scale: Array, model: Array
-) -> Float[Array, " n"]:
+def residual(observed: Any, state: int, states: Sequence[LoadedState], scale: Array) -> Float[Array, " n"]:
     """Compute the residual of an observation: computed minus measured value over the standard deviation [-].
 
     Args:
@@ -33,12 +31,7 @@ def residual(
         state: Number of the observed state; an increment has its own two.
         states: What observations see of the solved states.
         scale: Factor of computed increments [-].
-        model: Standard deviation of the computed values over that of the measured ones [-].
     """
-    return _over_noise(observed, state, states, scale) / jnp.sqrt(1.0 + model**2)
-
-
-def _over_noise(observed: Any, state: int, states: Sequence[LoadedState], scale: Array) -> Float[Array, " n"]:
     if isinstance(observed, AxialIncrement):
         computed = scale * axial_increment(states[observed.before], states[observed.after], observed.points)
         return (computed - observed.values) / observed.std

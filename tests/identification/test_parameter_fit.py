@@ -120,6 +120,20 @@ def test_a_wrong_model_shows_in_chi2(linear):
     assert float(allowed.std["thinning"]) > 10 * float(found.std["thinning"])
 
 
+def test_starts_again_where_the_first_optimum_explains_nothing(solution):
+    """Steps from the median end in the local minimum of t³ - 3t at 1, above the observed -8.1 at -2.5."""
+
+    def experiment(numbers):
+        t = numbers["t"]
+        return solution, moved(solution, 1e-3 * (t**3 - 3.0 * t) * modes(solution)[0])
+
+    first, second = experiment({"t": -2.5})
+    observed = op.AxialIncrement(POINTS, axial_increment(first, second, jnp.asarray(POINTS)), 1e-4)
+    found = op.fit_parameters(experiment, [observed], {"t": op.Normal(0.5, 1.5)}, scale=op.Normal(1.0, 1e-4))
+    assert float(found.numbers["t"]) == pytest.approx(-2.5, abs=1e-2)
+    assert found.steps > 5
+
+
 def test_maps_and_forces_and_bulges_are_observed(linear, solution):
     """What a state itself shows leaves no residual."""
     experiment, _, _ = linear
@@ -236,6 +250,31 @@ def test_frictions_from_phase_and_force(frictions):
     for name, value in (expected | {"scale": 1.005}).items():
         assert abs(float(found.numbers[name]) - value) < 3.0 * float(found.std[name])
     assert float(found.chi2["phase"]) == pytest.approx(len(POINTS), rel=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_room_for_programs")
+@pytest.mark.timeout(1500)
+def test_mesh_error_is_followed_into_the_numbers():
+    """Intervals hold a truth of a finer mesh, and states and residuals are of the fit's own."""
+    truth = plates(0.2, 0.08, elements=(14, 14, 4))
+    first = op.solve(truth, LOADS[0])
+    second = op.solve(truth, LOADS[1], start=first)
+    values = axial_increment(first, second, jnp.asarray(POINTS))
+    force = -float(first.stats["force_sample"][2])
+    found = op.fit_parameters(
+        (plates(0.15, 0.05, elements=(8, 8, 4)), LOADS),
+        [op.AxialIncrement(POINTS, values, 2e-6, scale_std=1e-3), (0, op.ForceReading(force, 0.02 * force))],
+        {"window.friction": op.LogNormal(0.15, 0.5), "sample.friction": op.LogNormal(0.05, 0.7)},
+    )
+    for name, value in {"window.friction": 0.2, "sample.friction": 0.08}.items():
+        low, high = found.intervals()[name]
+        assert low < value < high
+        assert float(found.mesh_std[name]) > 0.2 * float(found.std[name])
+    assert [one.palpation.elements for one in found.solutions] == [(8, 8, 4)] * 2
+    computed = float(found.numbers["scale"]) * axial_increment(*found.solutions, jnp.asarray(POINTS))
+    left = np.asarray(computed - values) / 2e-6
+    np.testing.assert_allclose(found.residuals["phase"] / left, np.median(found.residuals["phase"] / left), rtol=1e-3)
 
 
 @pytest.mark.slow
