@@ -13,7 +13,7 @@ from ..calibration import Calibration, calibrate
 from ..io import netcdf_bytes, read_stress_strain, write_together
 from ..solvers.progress import Progress
 from .curve_options import CurveOptions, LawOptions
-from .folder import prepare, refuse_links
+from .folder import prepare, refuse_finished, refuse_links
 from .options import PictureOptions, RunOptions
 from .output import pictures, with_drawings
 from .statement import configure_jax
@@ -44,10 +44,7 @@ def run_calibration(
         progress.stage("reading")
         configure_jax(run.no_cache)
         refuse_links(out, with_drawings(FILES))
-        if (out / FILES[-1]).exists() and not run.force:
-            raise FileExistsError(
-                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
-            )
+        refuse_finished(out, FILES[-1], run.force)
         columns = tuple(int(name) if name.lstrip("-").isdigit() else name for name in reading.columns)
         arguments: dict[str, Any] = {**vars(reading), "columns": columns}
         data = [read_stress_strain(path, **arguments) for path in curves]

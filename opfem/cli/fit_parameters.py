@@ -12,7 +12,7 @@ from rich.table import Column, Table
 from ..identification import ParameterFit, fit_parameters
 from ..io import netcdf_bytes, write_together
 from ..solvers.progress import Progress
-from .folder import prepare, refuse_links
+from .folder import prepare, refuse_finished, refuse_links
 from .observed_states import read_observed_states
 from .options import PictureOptions, RunOptions
 from .output import pictures, with_drawings
@@ -35,10 +35,7 @@ def run_fit(config: Path, out: Path, run: RunOptions, files: PictureOptions = Pi
         progress.stage("reading")
         configure_jax(run.no_cache)
         refuse_links(out, with_drawings(FILES))
-        if (out / FILES[-1]).exists() and not run.force:
-            raise FileExistsError(
-                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
-            )
+        refuse_finished(out, FILES[-1], run.force)
         states = read_observed_states(config)
         prepare(out)
         problem = (states.palpation, states.loads)

@@ -43,9 +43,14 @@ def settle(out: Path, force: bool) -> None:
     finish(out, RESULT)
     if (out / PLAN).exists():
         raise FileExistsError(f"--out {out} holds a sweep ({PLAN}). Choose another --out, or remove that folder.")
-    if (out / FINISHED).exists() and not force:
+    refuse_finished(out, FINISHED, force)
+
+
+def refuse_finished(out: Path, last: str, force: bool) -> None:
+    """Raise FileExistsError where the folder holds the file that is written last, and no `force`."""
+    if (out / last).exists() and not force:
         raise FileExistsError(
-            f"--out {out} holds a finished result ({FINISHED}). Pass --force to replace it, or another --out."
+            f"--out {out} holds a finished result ({last}). Pass --force to replace it, or another --out."
         )
 
 

@@ -11,7 +11,7 @@ from ..inverse.parameters import AbstractNumberPrior
 from ..io import read_displacement, read_thickness
 from ..measurement import ThicknessMap
 from ..model import Imprint, Layer, Palpation
-from .toml_file import read_toml
+from .toml_file import as_json, read_toml
 from .toml_parts import CONTACT, MATERIAL, built, face, material, sections, thickness_map
 
 _Numbers = tuple[float, ...]
@@ -119,7 +119,7 @@ def read_observed_states(path: Path) -> ObservedStates:
     options = parts.get("fit", {})
     if "scale_std" in options:
         options["scale"] = built("[fit] scale_std", lambda: Normal(1.0, options.pop("scale_std")))
-    return ObservedStates(palpation, loads, observations, parameters, options, stated)
+    return ObservedStates(palpation, loads, observations, parameters, options, as_json(stated))
 
 
 def _priors(path: Path, stated: Any) -> dict[str, AbstractNumberPrior]:

@@ -19,7 +19,7 @@ from ..io.masks import read_mask
 from ..measurement import MeasurementError, ThicknessMap
 from ..measurement.oct import EDGES, Interface, OctSystem, OctVolume, find_interface
 from ..solvers.progress import Progress
-from .folder import prepare, refuse_links
+from .folder import prepare, refuse_finished, refuse_links
 from .options import InterfaceOptions, MicroscopeOptions, PictureOptions, RunOptions, VolumeOptions
 from .output import pictures, with_drawings
 from .statement import configure_jax
@@ -60,10 +60,7 @@ def measure(
         progress.stage("reading")
         configure_jax(run.no_cache)
         refuse_links(out, with_drawings(FILES))
-        if (out / FILES[-1]).exists() and not run.force:
-            raise FileExistsError(
-                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
-            )
+        refuse_finished(out, FILES[-1], run.force)
         volume = read_volume(loaded, reading)
         before = None if unloaded is None else read_volume(unloaded, reading)
         prepare(out)

@@ -11,7 +11,7 @@ from rich.console import Console
 from ..io import displacement_bytes, write_together
 from ..measurement.oct import DisplacementVolume, OctSystem, axial_displacement
 from ..solvers.progress import Progress
-from .folder import prepare, refuse_links
+from .folder import prepare, refuse_finished, refuse_links
 from .oct import read_volume
 from .options import MicroscopeOptions, PictureOptions, RunOptions, VolumeOptions
 from .output import pictures, with_drawings
@@ -43,10 +43,7 @@ def measure_phase(
         progress.stage("reading")
         configure_jax(run.no_cache)
         refuse_links(out, with_drawings(FILES))
-        if (out / FILES[-1]).exists() and not run.force:
-            raise FileExistsError(
-                f"--out {out} holds a finished result ({FILES[-1]}). Pass --force to replace it, or another --out."
-            )
+        refuse_finished(out, FILES[-1], run.force)
         before, after = (read_volume(path, reading) for path in paths)
         prepare(out)
         progress.stage("displacement")

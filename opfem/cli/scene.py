@@ -4,7 +4,6 @@ Sections are the parts of an `Experiment`, keys their arguments; the numbers of 
 """
 
 import functools
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,7 +22,7 @@ from ..model import (
     Sample,
     Sphere,
 )
-from .toml_file import read_toml
+from .toml_file import as_json, read_toml
 from .toml_parts import CONTACT, MATERIAL, built, face, material, sections, thickness_map
 
 _SHAPES = {
@@ -135,17 +134,8 @@ def read_scene(path: Path) -> Scene:
         measured,
         parts.get("solver", {}).get("increments"),
         parts.get("pictures", {}).get("y"),
-        _as_json(stated),
+        as_json(stated),
     )
-
-
-def _as_json(value: Any) -> Any:
-    """Write infinite numbers as text; JSON has none."""
-    if isinstance(value, dict):
-        return {name: _as_json(entry) for name, entry in value.items()}
-    if isinstance(value, list):
-        return [_as_json(entry) for entry in value]
-    return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
 def _sample(thickness: float | ThicknessMap, parts: Mapping[str, Any]) -> Sample:

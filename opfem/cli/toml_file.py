@@ -1,5 +1,6 @@
 """Files of commands that take more than options can say: TOML, its values checked against types."""
 
+import math
 import tomllib
 import types
 import typing
@@ -59,3 +60,12 @@ def _in_words(choice: Any) -> str:
     if typing.get_origin(choice) is tuple:
         return f"a list of {len(parts)}, each {_in_words(parts[0])}"
     return {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(choice, "")
+
+
+def as_json(value: Any) -> Any:
+    """Write infinite numbers as text; JSON has none."""
+    if isinstance(value, dict):
+        return {name: as_json(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [as_json(entry) for entry in value]
+    return str(value) if isinstance(value, float) and math.isinf(value) else value

@@ -77,7 +77,8 @@ def sections(
     for section, names in needed.items():
         missing = [name for name in names if name not in stated.get(section, {})]
         if section not in stated or missing:
-            raise ValueError(f"{path} needs [{section}]" + (f" with {missing[0]} = ..." if missing else "") + ".")
+            stating = f"[[{section}]]" if section in tables else f"[{section}]"
+            raise ValueError(f"{path} needs {stating}" + (f" with {missing[0]} = ..." if missing else "") + ".")
     parts: dict[str, Any] = {}
     for section, found in stated.items():
         if section in tables:

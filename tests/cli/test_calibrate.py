@@ -7,19 +7,8 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from opfem import cli
 from opfem.cli.calibrate import FILES
-
-
-def opfem(*arguments) -> int:
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
+from tests.command_line import opfem
 
 
 @pytest.fixture

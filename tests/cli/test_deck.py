@@ -8,23 +8,11 @@ import pytest
 from PIL import Image
 
 import opfem as op
-from opfem import cli
+from tests.command_line import opfem
 from tests.decks.texts import imprint_deck, stacked_deck, text
 from tests.experiments import bumpy_map, inclusion_experiment, published_palpation
 
 FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
-
-
-def opfem(*arguments) -> int:
-    """Run the command line and return its exit status."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import xarray as xr
 from PIL import Image
 
 import opfem as op
-from opfem import cli
 from opfem.cli.fit_parameters import FILES
 from opfem.cli.observed_states import read_observed_states
+from tests.command_line import opfem
 
 LAYER = """
 [layer]
@@ -65,17 +65,6 @@ scale_std = 0.02
 """
 
 
-def opfem(*arguments) -> int:
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
-
-
 @pytest.fixture
 def config(tmp_path):
     """Write a file, and the files that it names."""
@@ -119,7 +108,7 @@ def test_a_file_states_experiment_loads_and_observations(config):
     ("parts", "message"),
     [
         ((LAYER, FORCE), 'needs [parameters], such as "window.friction"'),
-        ((LAYER, PRIORS), "needs [state]"),
+        ((LAYER, PRIORS), "needs [[state]]"),
         ((LAYER, "[[state]]\nthickness = 0.45\n", PRIORS), "states nothing that was observed"),
         ((LAYER, "[[state]]\nforce = 0.1\n", PRIORS), "[[state]] 1 needs thickness [mm]"),
         ((LAYER, "[[state]]\nthickness = 0.4\nforce = 0.1\n", PRIORS), "[[state]] 1 needs force_std [N]"),

@@ -18,27 +18,16 @@ from PIL import Image
 
 import opfem as op
 from opfem import cli
+from tests.command_line import opfem
 
 FILES = ("result.vtu", "pressure.png", "report.png", "report.html", "summary.json", "result.nc")
 FIT_FILES = ("result.vtu", "pressure.png", "fit.png", "report.html", "summary.json", "result.nc")
 SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
 
 
-def opfem(*arguments) -> int:
-    """Run the command line and return its exit status."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
 def contents(folder) -> dict[str, bytes]:
     """Read every file of a folder, hidden ones too."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
 
 
 @pytest.fixture

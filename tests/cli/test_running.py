@@ -16,23 +16,16 @@ import pytest
 import opfem as op
 from opfem import cli
 from opfem.cli import running
+from tests.command_line import opfem
 
 SMALL = ("--extent", "2", "2", "--l0", "0.5", "--elements", "6", "6", "2", "--smooth", "0.2")
 # A test run in the background hands on that Ctrl-C is ignored; a terminal does not.
 LISTEN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from opfem.cli import main; "
 
 
-def opfem(*arguments) -> int:
-    """Run the command line and return its exit status."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
 @pytest.fixture
 def palpated(tmp_path, solution, monkeypatch):
     """Return what writes a result without solving, and without pictures."""
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
     monkeypatch.setattr("opfem.cli.palpate.solve", lambda *_: solution)
     monkeypatch.setattr("opfem.plot.draw_pictures", lambda *_: {})
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import opfem as op
-from opfem import cli
 from opfem.cli.scene import read_scene
+from tests.command_line import opfem
 from tests.experiments import inclusion_experiment
 
 SCENE = """
@@ -54,18 +54,6 @@ std = 0.002
 seed = 3
 """
 FILES = ("map.npz", "result.vtu", "section.png", "report.png", "report.html", "summary.json", "result.nc")
-
-
-def opfem(*arguments) -> int:
-    """Run the command line and return its exit status."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
 
 
 @pytest.fixture

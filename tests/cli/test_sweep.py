@@ -10,9 +10,9 @@ import xarray as xr
 from PIL import Image
 
 import opfem as op
-from opfem import cli
 from opfem.cli.statement import read_maps, state_experiment
 from opfem.cli.sweep import _AXES, _inputs, _points, _read
+from tests.command_line import opfem
 from tests.tolerances import SOLVER
 
 CONFIG = """
@@ -31,18 +31,6 @@ window_friction = [0.0, 0.2]
 [outputs]
 keep = ["max_pressure", "pressure", "force_sample"]
 """
-
-
-def opfem(*arguments) -> int:
-    """Run the command line and return its exit status."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    return end.value.code
-
-
-@pytest.fixture(autouse=True)
-def _cache_of_the_user_is_left_alone(monkeypatch):
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
 
 
 @pytest.fixture

@@ -130,7 +130,6 @@ def accepted(*_, **__):
 def run(tmp_path, monkeypatch, capsys):
     """Run a command on a good map, and return its status and what it said."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("OPFEM_NO_CACHE", "1")
     for name in ("palpate.solve", "deck.solve", "fit.fit_traction", "sweep.compute"):
         monkeypatch.setattr(f"opfem.cli.{name}", accepted)
     np.save("map.npy", np.full((17, 21), 0.45))
