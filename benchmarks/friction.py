@@ -71,11 +71,10 @@ def points(thickness: float, side: float) -> np.ndarray:
 
 def solved(palpation: op.Palpation, loads) -> list[op.Solution]:
     """Solve the states in sequence."""
+    solver = op.Newton(rtol=1e-7, krylov_rtol=1e-3)
     states: list[op.Solution] = []
     for load in loads:
-        states.append(
-            op.solve(palpation, load, op.Newton(rtol=1e-7), start=states[-1] if states else None, progress=False)
-        )
+        states.append(op.solve(palpation, load, solver, start=states[-1] if states else None, progress=False))
     return states
 
 

@@ -117,8 +117,14 @@ def material(what: str, given: Mapping[str, Any]) -> AbstractMaterial:
     raise ValueError(f"{what} needs the numbers of one law [MPa], {known}; got {', '.join(numbers) or 'none'}.")
 
 
-def face(section: str, given: Mapping[str, Any]) -> Side:
-    """Build a face of the layer: a contact with its law and friction, bonded, or a roller."""
+def face(section: str, given: Mapping[str, Any], exact: bool = True) -> Side:
+    """Build a face of the layer: a contact with its law and friction, bonded, or a roller.
+
+    Args:
+        section: Its section.
+        given: What that states.
+        exact: Whether hard contact is exact where the section does not say.
+    """
     kind = given.get("kind", "contact")
     if kind != "contact":
         others = [name for name in given if name != "kind"]
@@ -135,7 +141,7 @@ def face(section: str, given: Mapping[str, Any]) -> Side:
     if law == "linear" and "stiffness" not in given:
         raise ValueError(f"[{section}] law 'linear' needs stiffness [MPa/mm].")
     makers: dict[str, Callable[[], Any]] = {
-        "hard": lambda: HardOverclosure(exact=given.get("exact", True)),
+        "hard": lambda: HardOverclosure(exact=given.get("exact", exact)),
         "exponential": lambda: ExponentialOverclosure(*({**_PUBLISHED, **given}[name] for name in ("p0", "c0"))),
         "linear": lambda: LinearOverclosure(given["stiffness"]),
     }

@@ -22,7 +22,7 @@ from ..inverse.parameters import AbstractNumberPrior, Normal, check_parameters, 
 from ..inverse.result import FitError
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
-from ..model import Load, Palpation
+from ..model import Contact, Load, Palpation
 from ..solvers import Newton, Solution, solve
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
@@ -55,7 +55,7 @@ def fit_parameters(
     *,
     scale: AbstractNumberPrior | None = None,
     model_std: float | None = None,
-    solver: Newton = Newton(rtol=1e-7),
+    solver: Newton = Newton(rtol=1e-7, krylov_rtol=1e-3),
     rtol: float = 0.05,
     max_steps: int = 30,
     throw: bool = True,
@@ -75,7 +75,8 @@ def fit_parameters(
         model_std: Standard deviation of computed increments due to the mesh [mm]. None: the mesh error of all computed
             values is estimated from one of two thirds of the elements along each axis, on which the fit begins. It is 0
             where a function solves.
-        solver: Settings of the solves; a looser `rtol` changes increments by as much as the phase resolves.
+        solver: Settings of the solves. A looser `rtol` changes increments by as much as the phase resolves; a looser
+            `krylov_rtol` cuts the increments of stiff penalties (`HardOverclosure`).
         rtol: Error of the numbers over their standard deviations at which the fit has converged [-]. Where no step
             reduces the misfit any more, up to 2 suffices and is added to the standard deviations.
         max_steps: Limit of steps, shortened ones included.
@@ -123,7 +124,7 @@ def fit_parameters(
     if throw and not found.converged:
         why, remedy = f"within max_steps={max_steps} steps", "Raise the limit"
         if found.stalled:
-            why, remedy = "though no step reduces the misfit any more", "Solve with a smaller rtol"
+            why, remedy = "though no step reduces the misfit any more", _remedy_of_stall(experiment)
         if not fitted.path.reached:
             why, remedy = f"on the mesh of the experiment: {fitted.path.failure}", "Take a finer mesh"
         raise FitError(
@@ -364,6 +365,14 @@ def _solved(
         start = states[-1] if states else None
         states.append(solve(palpation, load, solver, start=start, throw=False, progress=False))
     return tuple(states)
+
+
+def _remedy_of_stall(experiment: Experiment) -> str:
+    """Say what makes computed values smooth in the numbers: multipliers of exact contact update at full load."""
+    faces = () if callable(experiment) else (experiment[0].window, experiment[0].sample)
+    if any(isinstance(face, Contact) and face.law.exact for face in faces):
+        return "Press by a penalty, HardOverclosure(exact=False)"
+    return "Solve with a smaller rtol"
 
 
 def _check_first(pairs: list[tuple[int, Any]], path: LoadPath | SolvedStates) -> None:

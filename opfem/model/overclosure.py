@@ -74,7 +74,9 @@ class HardOverclosure(AbstractOverclosure):
     of the layer: more contact points than nodes would over-constrain it.
 
     `exact=False` is the penalty alone, for a tenth less work. Penetration is then about 1/stiffness_ratio of the
-    shortening of an element under the same pressure: about 0.05 µm at 10 kPa.
+    shortening of an element under the same pressure: about 0.05 µm at 10 kPa. Take it with `Newton(krylov_rtol=1e-3)`:
+    the residual of a linear solve counts mostly forces of the penalty. At the default 3e-2 errors of the first step
+    open half of a plate on 15×15×6 elements, which then takes 39 increments with snap-through instead of 8.
 
     An element's stiffness is the confined modulus, with at most 20 shear moduli for the bulk modulus, over the
     element's height; and times (height/width)² where it is wider than high: a flat layer bends, and stiffer contact

@@ -88,6 +88,7 @@ def test_a_file_states_experiment_loads_and_observations(config):
     found = read_observed_states(config(LAYER, FORCE, OTHERS, PRIORS))
     assert found.palpation.elements == (6, 6, 2)
     assert isinstance(found.palpation.window.law, op.HardOverclosure)
+    assert not found.palpation.window.law.exact
     assert isinstance(found.palpation.sample.law, op.ExponentialOverclosure)
     assert [float(load.thickness.values.mean()) for load in found.loads] == pytest.approx([0.45, 0.44])
     (one, force), (two, measured), increment, (of, bulge) = found.observations
@@ -128,6 +129,11 @@ def test_what_a_file_states_wrongly_is_named(config, tmp_path, capsys, parts, me
     assert message in said
     assert "Traceback" not in said
     assert not (tmp_path / "out" / "result.nc").exists()
+
+
+def test_hard_contact_may_be_exact(config):
+    stated = LAYER.replace("[window]", "[window]\nexact = true")
+    assert read_observed_states(config(stated, FORCE, PRIORS)).palpation.window.law.exact
 
 
 @pytest.mark.slow
