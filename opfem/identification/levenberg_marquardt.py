@@ -3,7 +3,7 @@
 A traced loop would compile all solves as one program.
 """
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from ..solvers.progress import Progress
 from .loaded_states import LoadPath, SolvedStates
+from .objective import Objective
 
 # Share of the predicted reduction above which damping falls, and the factor. Increments under friction reach the
 # default share of 0.99 near the optimum only: a fit of three numbers was at half of its way after 14 steps.
@@ -29,27 +30,6 @@ _MOST_REFUSED, _STALLED = 4, 2.0
 # Reduction of the misfit below which an accepted step counts as refused [-]: along an edge of that polygon steps creep,
 # 13 of them for 0.3 % and less than half of a standard deviation.
 _CREEPS = 1e-3
-
-
-@runtime_checkable
-class Objective(Protocol):
-    """Residuals of solved states by white numbers, and their Jacobian."""
-
-    def solve(self, white: Array) -> LoadPath | SolvedStates:
-        """Solve the states."""
-        ...
-
-    def residuals(self, white: Array, states: Any) -> Array:
-        """Compute the residuals of the states [-]."""
-        ...
-
-    def jacobian(self, white: Array, path: LoadPath | SolvedStates) -> Array:
-        """Compute their derivative by the white numbers."""
-        ...
-
-    def covariance(self, J: Array) -> Array:
-        """Compute the posterior covariance of the white numbers from that derivative."""
-        ...
 
 
 class Optimum(NamedTuple):

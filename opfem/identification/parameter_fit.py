@@ -6,10 +6,8 @@ number. First steps are on a coarser mesh, whose difference to the experiment's 
 followed into the numbers.
 """
 
-import dataclasses
-import functools
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,34 +16,30 @@ import numpy as np
 from jaxtyping import Array
 
 from ..inverse.observations import ForceReading, SideBulge
-from ..inverse.parameters import AbstractNumberPrior, Normal, check_parameters, with_numbers
+from ..inverse.parameters import AbstractNumberPrior, Normal, check_parameters
 from ..inverse.result import FitError
 from ..measurement import ThicknessMap
 from ..measurement.oct import AxialIncrement
-from ..model import Contact, Load, Palpation
-from ..solvers import Newton, Solution, solve
+from ..model import Contact
+from ..solvers import Newton
 from ..solvers.progress import Progress
 from ..solvers.solve import require_float64
 from .levenberg_marquardt import Optimum, minimise, undamped_step
-from .loaded_states import LoadedState, LoadPath, SolvedStates, can_follow, follow
+from .loaded_states import LoadPath, SolvedStates
+from .objective import Experiment, Objective
 from .result import SCALE, ParameterFit
-from .state_residuals import residual, source_of
+from .state_residuals import source_of
 
 # Shown on the progress line during compilation.
 _COMPILES = "the solver, about 10 s the first time"
 _COMPILES_DERIVATIVE = "the solver's derivative, about 15 s the first time"
 _INSENSITIVE = 1e-3  # norm of a Jacobian column over the largest one, below which the data do not depend on a number
-# Elements of the mesh over those of the coarser one, along each axis. On 15×15×6 elements increments are 1.2 to 2.6 nm
-# off for frictions up to 0.2, and 7.8 nm for 0.3 and 0.2; 10×10×4 tell 2.0 to 4.6, and 10.8 nm.
-_COARSER = 1.5
 # Points of the priors, the best of which is the second start. From the medians 0.15 and 0.05, the fit of frictions 0.3
 # and 0.2 ends in a local optimum without friction at the sample. The best as the first start is no better: 0.2 and 0.08
 # then end at 0.56 and 0.
 _STARTS = 8
 _UNEXPLAINED = 2.0  # mean squared residual above which the fit is repeated from the second start
 _IDENTICAL = 1e-10  # mm: states that differ by less are identical, to solver tolerance
-
-Experiment = Callable[[dict[str, Array]], tuple[Solution, ...]] | tuple[Palpation, Sequence[Load]]
 
 
 def fit_parameters(
@@ -74,7 +68,7 @@ def fit_parameters(
             largest `scale_std` of the increments.
         model_std: Standard deviation of computed increments due to the mesh [mm]. None: the mesh error of all computed
             values is estimated from one of two thirds of the elements along each axis, on which the fit begins. It is 0
-            where a function solves.
+            where a function solves, and on a single element.
         solver: Settings of the solves. A looser `rtol` changes increments by as much as the phase resolves; a looser
             `krylov_rtol` cuts the increments of stiff penalties (`HardOverclosure`).
         rtol: Error of the numbers over their standard deviations at which the fit has converged [-]. Where no step
@@ -96,7 +90,7 @@ def fit_parameters(
         scale = Normal(1.0, max(float(one.scale_std) for one in increments))
     priors = {**parameters, **({SCALE: scale} if scale is not None and increments else {})}
     model = [_ratio(observed, model_std) for _, observed in pairs]
-    fit = _Fit(experiment, pairs, priors, model, solver)
+    fit = Objective(experiment, pairs, priors, model, solver)
     coarse = fit.on_coarser_mesh() if model_std is None else None
     with Progress(progress) as bar:
         bar.stage("states at the priors' medians", compiles=_COMPILES)
@@ -114,7 +108,7 @@ def fit_parameters(
         fitted = _minimised(fit, coarse, white, path, rtol, max_steps, bar)
         if not fitted.found.converged or float(jnp.mean(fitted.found.residual**2)) > _UNEXPLAINED:
             bar.stage("points of the priors")
-            white, path = (coarse or fit).other_start(bar)
+            white, path = _other_start(coarse or fit, bar)
             bar.stage("fit from the best of them")
             other = _minimised(fit, coarse, white, path, rtol, max_steps, bar)
             steps = fitted.found.steps + other.found.steps
@@ -136,14 +130,14 @@ def fit_parameters(
 class _Fitted(NamedTuple):
     """A fit with its weights, its optimum, and the states there on the experiment's mesh."""
 
-    fit: "_Fit"
+    fit: Objective
     found: Optimum
     path: LoadPath | SolvedStates
 
 
 def _minimised(
-    fit: "_Fit",
-    coarse: "_Fit | None",
+    fit: Objective,
+    coarse: Objective | None,
     white: Array,
     path: LoadPath | SolvedStates,
     rtol: float,
@@ -177,143 +171,20 @@ def _minimised(
     return _Fitted(fit, found._replace(steps=steps + found.steps), found.path)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    """What is fitted, and how.
+def _other_start(objective: Objective, bar: Progress) -> tuple[Array, LoadPath | SolvedStates]:
+    """Return the point of lowest misfit among a few that are spread over the priors, with its states.
 
-    Attributes:
-        experiment: The experiment.
-        pairs: Observations, each with the number of its state.
-        priors: Priors of the numbers, by name.
-        model: For each observation, the standard deviation of computed values over that of the measured ones [-].
-        solver: Settings of the solves.
-        errors: Estimated mesh error of each observation's computed values, over the same [-]; none: not estimated.
+    The scale stays at its median: its prior is narrow, but moves all increments by more than their noise.
     """
-
-    experiment: Experiment
-    pairs: list[tuple[int, Any]]
-    priors: dict[str, AbstractNumberPrior]
-    model: list[Array]
-    solver: Newton
-    errors: tuple[Array, ...] = ()
-
-    def numbers(self, white: Array) -> dict[str, Array]:
-        """Return the numbers by name."""
-        return {name: prior.number(white[place]) for place, (name, prior) in enumerate(self.priors.items())}
-
-    def of_experiment(self, white: Array) -> dict[str, Array]:
-        """Return the numbers of the experiment by name: all but the scale."""
-        return {name: one for name, one in self.numbers(white).items() if name != SCALE}
-
-    def solve(self, white: Array) -> LoadPath | SolvedStates:
-        """Solve the states in sequence."""
-        numbers = self.of_experiment(white)
-        if callable(self.experiment):
-            return SolvedStates(self.experiment, numbers, tuple(self.experiment(numbers)))
-        palpation, loads = self.experiment
-        if can_follow(loads):
-            return follow(palpation, loads, numbers, self.solver)
-        solved = functools.partial(_solved, palpation, loads, self.solver)
-        return SolvedStates(solved, numbers, solved(numbers))
-
-    def over_noise(self, white: Array, states: Sequence[LoadedState]) -> list[Array]:
-        """Compute computed minus measured values of each observation over the noise [-]."""
-        factor = self.numbers(white).get(SCALE, jnp.ones(()))
-        return [residual(observed, state, states, factor) for state, observed in self.pairs]
-
-    def parts(self, white: Array, states: Sequence[LoadedState]) -> list[Array]:
-        """Compute the residuals of each observation [-]."""
-        return [
-            one / jnp.hypot(1.0, model) for one, model in zip(self.over_noise(white, states), self.model, strict=True)
-        ]
-
-    def residuals(self, white: Array, states: Sequence[LoadedState]) -> Array:
-        """Compute all residuals, those of the priors last [-]."""
-        return jnp.concatenate([*self.parts(white, states), white])
-
-    def jacobian(self, white: Array, path: LoadPath | SolvedStates) -> Array:
-        """Compute the derivative of the residuals by the white numbers."""
-        basis, states = jnp.eye(white.size), path.states()
-        directions = [jax.jvp(self.of_experiment, (white,), (one,))[1] for one in basis]
-
-        def column(one, changes):
-            return jax.jvp(self.residuals, (white, states), (one, changes))[1]
-
-        return jax.vmap(column, out_axes=1)(basis, path.changes(directions))
-
-    def covariances(self, J: Array) -> tuple[Array, Array]:
-        """Compute the covariance of the white numbers without the mesh error, and that of their changes with it.
-
-        The estimate is more certain in its size than in its pattern. Where its parts have opposite effects on a number,
-        the change with all of it is too small: the changes with its part in each region are added, as if independent.
-        """
-        inverse = jnp.linalg.inv(J.T @ J)
-        if not self.errors:
-            return inverse, jnp.zeros_like(inverse)
-        regions = []
-        for place, ((_, observed), one) in enumerate(zip(self.pairs, self.errors, strict=True)):
-            region = jnp.full(one.size, 8 * place)
-            if isinstance(observed, AxialIncrement):  # octants
-                upper = observed.points > jnp.median(observed.points, axis=0)
-                region += upper.astype(int) @ jnp.array([1, 2, 4])
-            regions.append(region)
-        errors = [one / jnp.hypot(1.0, model) for one, model in zip(self.errors, self.model, strict=True)]
-        change = inverse @ J[: -len(inverse)].T * jnp.concatenate(errors)
-        each = jax.ops.segment_sum(change.T, jnp.concatenate(regions), 8 * len(regions))
-        whole = jnp.sum(each, axis=0)
-        return inverse, each.T @ each + whole * whole[:, None]
-
-    def covariance(self, J: Array) -> Array:
-        """Compute the posterior covariance of the white numbers."""
-        without, mesh = self.covariances(J)
-        return without + mesh
-
-    def other_start(self, bar: Progress) -> tuple[Array, LoadPath | SolvedStates]:
-        """Return the point of lowest misfit among a few that are spread over the priors, with its states.
-
-        The scale stays at its median: its prior is narrow, but moves all increments by more than their noise.
-        """
-        spread = jnp.asarray([name != SCALE for name in self.priors], float)
-        best, least, states = jnp.zeros_like(spread), np.inf, None
-        for number, point in enumerate(spread * _spread_over_normal(_STARTS, spread.size)):
-            path = self.solve(point)
-            misfit = float(jnp.sum(self.residuals(point, path.states()) ** 2)) if path.reached else np.inf
-            bar.show(f"point {number + 1} of {_STARTS}, misfit {misfit:.5g}")
-            if misfit < least:
-                best, least, states = point, misfit, path
-        return best, states or self.solve(best)
-
-    def on_coarser_mesh(self) -> "_Fit | None":
-        """Return the fit on fewer elements; None where a function solves, or there are none to leave out."""
-        if callable(self.experiment):
-            return None
-        palpation, loads = self.experiment
-        even = 2 if palpation.element == "tet10" else 1
-        elements = tuple(even * int(np.ceil(n / (_COARSER * even))) for n in palpation.elements)
-        if elements == palpation.elements:
-            return None
-        return dataclasses.replace(self, experiment=(dataclasses.replace(palpation, elements=elements), loads))
-
-    def weighted(
-        self, other: "_Fit", white: Array, here: LoadPath | SolvedStates, there: LoadPath | SolvedStates
-    ) -> "_Fit":
-        """Return the fit with the mesh error among its weights, estimated by Richardson extrapolation of second order.
-
-        Args:
-            other: The fit on another mesh.
-            white: The point of the estimate.
-            here: States there.
-            there: The same on the other mesh; where they are not reached, the fit stays as it is.
-        """
-        if not there.reached:
-            return self
-        assert not callable(self.experiment)
-        assert not callable(other.experiment)
-        count, others = (np.prod(palpation.elements) for palpation in (self.experiment[0], other.experiment[0]))
-        share = 1.0 - float(count / others) ** (2.0 / 3.0)
-        values = zip(self.over_noise(white, here.states()), other.over_noise(white, there.states()), strict=True)
-        errors = tuple((a - b) / share for a, b in values)
-        return dataclasses.replace(self, errors=errors, model=[jnp.sqrt(jnp.mean(one**2)) for one in errors])
+    spread = jnp.asarray([name != SCALE for name in objective.priors], float)
+    best, least, states = jnp.zeros_like(spread), np.inf, None
+    for number, point in enumerate(spread * _spread_over_normal(_STARTS, spread.size)):
+        path = objective.solve(point)
+        misfit = float(jnp.sum(objective.residuals(point, path.states()) ** 2)) if path.reached else np.inf
+        bar.show(f"point {number + 1} of {_STARTS}, misfit {misfit:.5g}")
+        if misfit < least:
+            best, least, states = point, misfit, path
+    return best, states or objective.solve(best)
 
 
 def _spread_over_normal(count: int, size: int) -> Array:
@@ -356,17 +227,6 @@ def _pairs(observations: Sequence[Any]) -> list[tuple[int, Any]]:
     return pairs
 
 
-def _solved(
-    palpation: Palpation, loads: Sequence[Load], solver: Newton, numbers: dict[str, Array]
-) -> tuple[Solution, ...]:
-    palpation = with_numbers(palpation, numbers)
-    states: list[Solution] = []
-    for load in loads:
-        start = states[-1] if states else None
-        states.append(solve(palpation, load, solver, start=start, throw=False, progress=False))
-    return tuple(states)
-
-
 def _remedy_of_stall(experiment: Experiment) -> str:
     """Say what makes computed values smooth in the numbers: multipliers of exact contact update at full load."""
     faces = () if callable(experiment) else (experiment[0].window, experiment[0].sample)
@@ -393,7 +253,7 @@ def _check_first(pairs: list[tuple[int, Any]], path: LoadPath | SolvedStates) ->
                 )
 
 
-def _result(fit: _Fit, found: Optimum, path: LoadPath | SolvedStates) -> ParameterFit:
+def _result(fit: Objective, found: Optimum, path: LoadPath | SolvedStates) -> ParameterFit:
     white, J, names = found.white, found.J, tuple(fit.priors)
     data = J[: -len(names)]
     columns = np.asarray(jnp.sqrt(jnp.sum(data**2, axis=0)))

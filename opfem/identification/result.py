@@ -69,7 +69,10 @@ class ParameterFit(eqx.Module):
 
     @property
     def mesh_std(self) -> dict[str, Array]:
-        """Part of the standard deviations that is due to the mesh, by name."""
+        """Part of the standard deviations that is due to the mesh, by name.
+
+        Nodes that begin to slip one after the other may keep the fit from its optimum: what was left is included.
+        """
         return dict(zip(self.names, self._slope * jnp.sqrt(jnp.diag(self.white_mesh_covariance)), strict=True))
 
     @property
