@@ -16,6 +16,7 @@ _STICK = 1  # status of a contact point
 _PRIOR_DOMINATED = 0.7  # posterior over prior standard deviation: the data halve the variance below it
 _CORRELATED = 0.95  # correlation above which two numbers are identified only in combination
 _CHI2 = 2.0  # per datum, above which the model does not explain a source
+_CHI2_LEAST = 15.0  # of one datum, 3.9 standard deviations off: one in 10 000 by chance
 
 
 class ParameterFit(eqx.Module):
@@ -121,7 +122,7 @@ class ParameterFit(eqx.Module):
                     )
         for name, values in self.residuals.items():
             free = max(values.size - len(self.names), 1)
-            if float(jnp.sum(values**2)) > _CHI2 * free and values.size > 1:
+            if float(jnp.sum(values**2)) > max(_CHI2 * free, _CHI2_LEAST):
                 said.append(
                     f"χ² of {name} is {float(jnp.sum(values**2)) / free:.1f} a datum: the model cannot explain it. Is "
                     "a fixed number wrong, such as the bulk modulus, or the mesh too coarse?"

@@ -120,6 +120,14 @@ def test_a_wrong_model_shows_in_chi2(linear):
     assert float(allowed.std["thinning"]) > 10 * float(found.std["thinning"])
 
 
+def test_one_force_that_is_far_off_shows_in_chi2(linear, solution):
+    experiment, observed, _ = linear
+    force = -float(solution.stats["force_sample"][2])
+    for off, said in ((2.0, False), (5.0, True)):
+        found = op.fit_parameters(experiment, [observed, (0, op.ForceReading(force + off * 1e-3, 1e-3))], PRIORS)
+        assert any("χ² of force" in one for one in found.advice()) == said
+
+
 def test_starts_again_where_the_first_optimum_explains_nothing(solution):
     """Steps from the median end in the local minimum of t³ - 3t at 1, above the observed -8.1 at -2.5."""
 
