@@ -23,7 +23,7 @@ from .result import SCALE
 from .state_residuals import residual
 
 # Elements of the mesh over those of the coarser one, along each axis. On 15×15×6 elements increments are 1.2 to 2.6 nm
-# off for frictions up to 0.2, and 7.8 nm for 0.3 and 0.2; 10×10×4 tell 2.0 to 4.6, and 10.8 nm.
+# off for frictions up to 0.2, and 7.8 nm for 0.3 and 0.2; estimated from 10×10×4 as 2.0 to 4.6, and 10.8 nm.
 _COARSER = 1.5
 
 Experiment = Callable[[dict[str, Array]], tuple[Solution, ...]] | tuple[Palpation, Sequence[Load]]

@@ -2,8 +2,8 @@
 
 States are solved in sequence, each from the previous one. Levenberg–Marquardt steps of optimistix fit a few white
 numbers, on the host, so that all states share the solver's compiled programs. The Jacobian is dense, a column per
-number. First steps are on a coarser mesh, whose difference to the experiment's tells the error of the mesh; it is
-followed into the numbers.
+number. First steps are on a coarser mesh, whose difference to the experiment's estimates the mesh error; the standard
+deviations of the numbers include its effect.
 """
 
 import warnings
