@@ -10,7 +10,9 @@ has 2 nm of noise, all have a scale that is off by 1 %. A quarter of a layer of 
     plain    both frictions from that force and C10 known to 2 %
     middle   as phase, from mid depth alone, where the sum of the frictions does not show
     bulk     as phase, with the bulk modulus fixed at 50 times the true one
-    decks    `--deck fQOCE_sim_frict_*.inp.gz`: as force, of the layer, thickness and frictions of a published deck
+    decks    `--deck fQOCE_sim_frict_*.inp.gz`: as force, of the layer, thickness and frictions of a published deck,
+             on its own elements where `--elements` names none; five layers through the thickness find frictions
+             that three, as frict_med has, miss
 """
 
 import argparse
@@ -150,14 +152,14 @@ def plate_case(case: str, frictions, elements, draw: int):
     return experiment, observations, priors, known
 
 
-def deck_case(path: Path, draw: int):
+def deck_case(path: Path, elements, draw: int):
     """State a fit to what is simulated of a published deck: its frictions from its force and an increment."""
     rng = np.random.default_rng((1, draw))
     palpation, load = quarter(op.read_inp(path), "mean_dilatation", "deck")
     side, thickness = float(palpation.extent[0]), float(load.thickness.values[0, 0])
     loads = [load, pressed(thickness - STEP, side)]
     faces = {name: contact(float(getattr(palpation, name).friction)) for name in ("window", "sample")}
-    palpation = dataclasses.replace(palpation, **faces)
+    palpation = dataclasses.replace(palpation, elements=elements or palpation.elements, **faces)
     finest = dataclasses.replace(palpation, elements=finer(palpation.elements), element="hybrid")
     truth = solved(finest, loads)
     scale = 1.0 + SCALE_STD * rng.standard_normal()
@@ -177,7 +179,7 @@ def main() -> None:
     """Run a case."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("case", choices=("phase", "force", "plain", "middle", "bulk", "decks"))
-    parser.add_argument("--elements", default="10x10x4")
+    parser.add_argument("--elements", help="nx x ny x nz; default: 10x10x4, or those of the deck")
     parser.add_argument("--frictions", nargs="*", default=[",".join(map(str, pair)) for pair in PAIRS])
     parser.add_argument("--draws", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
@@ -185,14 +187,14 @@ def main() -> None:
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     op.cache_compilation()
-    elements = tuple(int(n) for n in chosen.elements.split("x"))
+    elements = tuple(int(n) for n in chosen.elements.split("x")) if chosen.elements else None
     for what in chosen.deck if chosen.case == "decks" else chosen.frictions:
         for draw in range(chosen.first, chosen.first + chosen.draws):
             if chosen.case == "decks":
-                stated, about = deck_case(what, draw), what.name
+                stated, about = deck_case(what, elements, draw), what.name
             else:
                 about = tuple(float(one) for one in what.split(","))
-                stated = plate_case(chosen.case, about, elements, draw)
+                stated = plate_case(chosen.case, about, elements or (10, 10, 4), draw)
             blocks = sum(one.values.size for one in stated[1] if isinstance(one, op.AxialIncrement))
             line = {"case": chosen.case, "of": about, "elements": stated[0][0].elements, "draw": draw, "blocks": blocks}
             print(json.dumps(line | fitted(*stated)), flush=True)
