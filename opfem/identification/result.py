@@ -82,6 +82,12 @@ class ParameterFit(eqx.Module):
         return dict(zip(self.names, jnp.sqrt(jnp.diag(self.white_covariance)), strict=True))
 
     @property
+    def white_std(self) -> dict[str, Array]:
+        """Standard deviations of the white numbers, that of the mesh error included, by name [-]."""
+        variance = jnp.diag(self.white_covariance + self.white_mesh_covariance)
+        return dict(zip(self.names, jnp.sqrt(variance), strict=True))
+
+    @property
     def correlation(self) -> Float[Array, "k k"]:
         """Correlation of the numbers, in the order of `names` [-]."""
         return _correlation(self.covariance)
@@ -93,9 +99,8 @@ class ParameterFit(eqx.Module):
             coverage: Probability of an interval [-].
         """
         half = float(jax.scipy.stats.norm.ppf(0.5 + 0.5 * coverage))
-        spread = jnp.sqrt(jnp.diag(self.white_covariance + self.white_mesh_covariance))
         found = {}
-        for name, white, std in zip(self.names, self.white, spread, strict=True):
+        for (name, std), white in zip(self.white_std.items(), self.white, strict=True):
             low, high = (float(self.priors[name].number(white + sign * half * std)) for sign in (-1.0, 1.0))
             found[name] = low, high
         return found

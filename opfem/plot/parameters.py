@@ -90,7 +90,7 @@ def _explained(fit: ParameterFit) -> list[str]:
 def _draw_number(ax: Any, fit: ParameterFit, place: int, factor: float) -> None:
     """Draw the densities of posterior and prior, over their largest values, and the 95 % interval."""
     name = fit.names[place]
-    prior, mean, spread = fit.priors[name], float(fit.white[place]), float(fit.prior_share[name])
+    prior, mean, spread = fit.priors[name], float(fit.white[place]), float(fit.white_std[name])
     white = mean + spread * np.linspace(-_REACH, _REACH, _POINTS)
     number = factor * np.asarray(prior.number(jnp.asarray(white)))
     slope = np.abs(np.gradient(number, white))

@@ -322,3 +322,13 @@ def test_picture_shows_every_number_and_pair(linear):
     assert axes.shape == (3, 3)
     assert [ax.get_xlabel() for ax in axes[-1]] == ["thinning [-]", "wave [-]", "scale [-]"]
     assert [[ax.get_visible() for ax in row] for row in axes.tolist()] == np.tri(3, dtype=bool).tolist()
+
+
+def test_curves_of_the_picture_include_the_mesh_error(linear):
+    experiment, observed, _ = linear
+    found = op.fit_parameters(experiment, [observed], {"thinning": op.Normal(1.0, 1.0)})
+    found = eqx.tree_at(lambda fit: fit.white_mesh_covariance, found, 8.0 * found.white_covariance)
+    curve = op.plot_parameters(found)[0, 0].get_lines()[0].get_xdata()
+    std = float(found.std["thinning"])
+    assert std == pytest.approx(3.0 * float(found.prior_share["thinning"]), rel=1e-5)
+    np.testing.assert_allclose(np.ptp(curve), 8.0 * std, rtol=1e-5)
