@@ -57,6 +57,7 @@ def plot_parameters(fit: ParameterFit, figure: Figure | None = None) -> np.ndarr
             elif column < row:
                 ax.tick_params(labelleft=False)
             ax.locator_params(axis="x", nbins=_TICKS)
+            ax.ticklabel_format(useOffset=False)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="upper right", frameon=False)
     figure.suptitle(", ".join(_explained(fit)), x=0.02, ha="left", fontsize="medium")
     figure.align_labels()
@@ -101,7 +102,13 @@ def _draw_number(ax: Any, fit: ParameterFit, place: int, factor: float) -> None:
     ax.fill_between(number[inside], posterior[inside] / posterior.max(), color=_POSTERIOR, alpha=0.3, linewidth=0)
     ax.plot(number, posterior / posterior.max(), color=_POSTERIOR, label="posterior, 95 % filled")
     ax.plot(number, expected / expected.max(), "--", color=_PRIOR, label="prior")
-    ax.set(yticks=[], ylim=(0.0, 1.1), title=f"{low:.3g} to {high:.3g}")
+    ax.set(yticks=[], ylim=(0.0, 1.1), title=_interval(low, high))
+
+
+def _interval(low: float, high: float) -> str:
+    """Format an interval to two significant digits of its width."""
+    digits = max(1 - int(np.floor(np.log10(high - low))), 0) if high > low else 3
+    return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def _draw_pair(ax: Any, centre: np.ndarray, covariance: np.ndarray) -> None:

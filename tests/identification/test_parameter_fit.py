@@ -318,9 +318,12 @@ def test_intervals_are_those_of_the_posterior(linear):
 
 def test_picture_shows_every_number_and_pair(linear):
     experiment, observed, _ = linear
-    axes = op.plot_parameters(op.fit_parameters(experiment, [observed], PRIORS))
+    found = op.fit_parameters(experiment, [observed], PRIORS)
+    axes = op.plot_parameters(found)
     assert axes.shape == (3, 3)
     assert [ax.get_xlabel() for ax in axes[-1]] == ["thinning [-]", "wave [-]", "scale [-]"]
+    low, high = (float(end) for end in axes[2, 2].get_title().split(" to "))
+    assert 0.9 * (high - low) < 2 * 1.959964 * float(found.std["scale"]) < 1.1 * (high - low)
     assert [[ax.get_visible() for ax in row] for row in axes.tolist()] == np.tri(3, dtype=bool).tolist()
 
 
