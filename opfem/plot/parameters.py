@@ -106,8 +106,10 @@ def _draw_number(ax: Any, fit: ParameterFit, place: int, factor: float) -> None:
 
 
 def _interval(low: float, high: float) -> str:
-    """Format an interval to two significant digits of its width."""
-    digits = max(1 - int(np.floor(np.log10(high - low))), 0) if high > low else 3
+    """Format an interval to two significant digits of its width; to three of its ends where that is no number."""
+    if not 0.0 < high - low < np.inf:
+        return f"{low:.3g} to {high:.3g}"
+    digits = max(1 - int(np.floor(np.log10(high - low))), 0)
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
